@@ -19,7 +19,7 @@ import difflib
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from torch import Tensor
 
@@ -129,7 +129,11 @@ class SupervisionLoss(StageHook):
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
         prediction, target = image, context.target
         if context.accumulated is not None:  # the base is always compared with its target
-            prediction, target = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
+            pair = self._supervision.pair(image, target, context.accumulated, context.coarse_target)
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                name = type(self._supervision).__qualname__
+                raise UserInputError(f"supervision {name}: pair returned {_describe(pair)}, expected two images")
+            prediction, target = pair
         return photometric_loss(fill_outside(prediction, target, context.weight), target, self._ssim_weight)
 
 
@@ -239,7 +243,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
         UserInputError: one cannot be imported or created, or is not a usable hook; the line names it.
     """
     hooks = []
-    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.name, entry.value)):
+    for entry in _entries():
         source = f"entry point {entry.name} ({entry.value})"
         try:
             hook = entry.load()()
@@ -251,6 +255,16 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
         verify_hook(hook, source)
         hooks.append(hook)
     return tuple(hooks)
+
+
+def hooks_line() -> str | None:
+    """Say which hooks installed packages register: they take part in every run. None without any."""
+    found = [f"{entry.name} ({entry.value})" for entry in _entries()]
+    return f"hooks of installed packages: {', '.join(found)}" if found else None
+
+
+def _entries() -> list[EntryPoint]:
+    return sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.name, entry.value))
 
 
 HOOK_NAMES = tuple(name for name in vars(StageHook) if not name.startswith("_"))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any
@@ -107,6 +108,12 @@ def check_values(settings: Any) -> None:
             raise UserInputError(f"{name} {value}: expected at least {declared.least:g}")
         if declared.most is not None and not value <= declared.most:
             raise UserInputError(f"{name} {value}: expected at most {declared.most:g}")
+
+
+def require_positive(name: str, value: float, kind: str) -> None:
+    """Raise a UserInputError about a number that is not positive and finite."""
+    if not (value > 0.0 and math.isfinite(value)):
+        raise UserInputError(f"{name} {value}: expected a positive {kind}")
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:

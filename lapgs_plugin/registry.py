@@ -71,6 +71,7 @@ class Registry(Generic[T]):
             found = loaded.__name__ if is_class else f"a {type(loaded).__name__}"
             raise UserInputError(f"{label} is {found}, expected a subclass of {self._kind.__name__}; {advice}")
         if not self._classes and not isinstance(loaded, self._kind):
-            raise UserInputError(f"{label} is a {type(loaded).__name__}, expected a {self._kind.__name__}; {advice}")
+            found = f"the class {loaded.__name__}" if is_class else f"a {type(loaded).__name__}"
+            raise UserInputError(f"{label} is {found}, expected an instance of {self._kind.__name__}; {advice}")
         result: T = loaded
         return result

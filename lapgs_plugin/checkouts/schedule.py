@@ -13,7 +13,7 @@ import copy
 import inspect
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, cast
 
@@ -50,16 +50,18 @@ class Operand:
     """Hold what the loop's variable is compared with.
 
     Attributes:
-        node: the expression.
-        periodic: whether the variable is divided by it: `iteration % node`.
+        written: the expression.
+        periodic: whether the variable is divided by it: `iteration % written`.
         operator: of the comparison, with the variable on its left.
         comparison: the whole comparison.
+        node: the option or number that it stands for: itself, or the value of a local variable.
     """
 
-    node: ast.expr
+    written: ast.expr
     periodic: bool
     operator: type[ast.cmpop]
     comparison: ast.expr
+    node: ast.expr
 
     @property
     def text(self) -> str:
@@ -88,7 +90,7 @@ class Operand:
         """Elements of a list that is written out."""
         written = self.is_list and isinstance(self.node, (ast.List, ast.Tuple, ast.Set))
         elements = self.node.elts if written else []  # type: ignore[attr-defined]  # as just checked
-        return [Operand(each, False, ast.Eq, self.comparison) for each in elements]
+        return [Operand(each, False, ast.Eq, self.comparison, each) for each in elements]
 
     def value(self, variables: Mapping[str, Any]) -> Any:
         """Return its value, None if that is known inside of the loop only."""
@@ -123,6 +125,14 @@ class Event:
     operands: tuple[Operand, ...]
     around: tuple[Operand, ...]
     calls: tuple[str, ...]
+
+    def resolved(self, variables: Mapping[str, ast.expr]) -> Event:
+        """Return the event with the values of local variables, by name, in place of the variables."""
+
+        def resolve(operands: tuple[Operand, ...]) -> tuple[Operand, ...]:
+            return tuple(replace(each, node=variables.get(ast.unparse(each.written), each.node)) for each in operands)
+
+        return replace(self, operands=resolve(self.operands), around=resolve(self.around))
 
     @property
     def period(self) -> Operand | None:
@@ -161,7 +171,11 @@ class Event:
 
     def describe(self, variables: Mapping[str, Any]) -> str:
         """Return one line: the condition, with the values of options that are known, and the functions it calls."""
-        known = {_place(each.node): each.value(variables) for each in self.operands if each.option is not None}
+        known = {
+            _place(each.written): each.value(variables)
+            for each in self.operands
+            if each.option is not None or each.node is not each.written
+        }
         rewriter = _Rewriter({place: value for place, value in known.items() if value is not None})
         test = rewriter.visit(copy.deepcopy(self.test))
         return f"line {self.test.lineno}: {ast.unparse(test)}" + f" ({', '.join(self.calls)})" * bool(self.calls)
@@ -180,7 +194,9 @@ class Schedule:
     def __init__(self, function: ast.FunctionDef) -> None:
         self._function = function
         loop, self._variable = _iteration_loop(function)
-        self.events = [] if loop is None else list(_events(loop.body, self._variable, ()))
+        variables = _constants(function)
+        events = () if loop is None else _events(loop.body, self._variable, ())
+        self.events = [event.resolved(variables) for event in events]
 
     def describe(self, variables: Mapping[str, Any] | None = None) -> list[str]:
         """Return a line for each event that calls something, or has a number of its own, and can happen.
@@ -374,6 +390,20 @@ def _iteration_loop(function: ast.FunctionDef) -> tuple[ast.For | None, str]:
     return max(loops, key=lambda loop: sum(1 for _ in ast.walk(loop[0])), default=(None, ""))
 
 
+def _constants(function: ast.FunctionDef) -> dict[str, ast.expr]:
+    """Return the values of local variables that are set once, to an option, an argument or a number."""
+    stored = [node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
+    found: dict[str, ast.expr] = {}
+    for node in ast.walk(function):
+        if not (isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name)):
+            continue
+        option = _option(node.value)
+        known = isinstance(node.value, ast.Constant) if option is None else option[0] not in stored
+        if known and stored.count(node.targets[0].id) == 1:
+            found[node.targets[0].id] = node.value
+    return found
+
+
 def _names(node: ast.AST) -> set[str]:
     return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
 
@@ -422,8 +452,8 @@ def _operand(
 ) -> Operand:
     for node in ast.walk(side):
         if isinstance(node, ast.BinOp) and _divides(node, variable):
-            return Operand(node.right, True, operator, comparison)
-    return Operand(other, False, operator, comparison)
+            return Operand(node.right, True, operator, comparison, node.right)
+    return Operand(other, False, operator, comparison, other)
 
 
 def _divides(node: ast.expr, variable: str) -> bool:

@@ -48,6 +48,25 @@ class External:
 
 
 @dataclass(frozen=True)
+class OwnPackage:
+    """Name a package that a checkout brings to be installed.
+
+    Attributes:
+        folder: folder of its setup.py.
+        needs_cuda: whether it is compiled for CUDA.
+    """
+
+    folder: Path
+    needs_cuda: bool
+
+    @property
+    def install(self) -> str:
+        """The command that installs it."""
+        # A build of its own would not find the PyTorch that it is compiled for.
+        return f"pip install {'--no-build-isolation ' * self.needs_cuda}{self.folder}"
+
+
+@dataclass(frozen=True)
 class CheckoutSource:
     """Describe a checkout by its sources.
 
@@ -143,6 +162,14 @@ class CheckoutSource:
             return []
         known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
         return [name for name in names if name not in known]
+
+    def own_package(self, package: str) -> OwnPackage | None:
+        """Return the folder of the checkout that a package is installed from; None if there is none."""
+        for setup in sorted([*self.root.glob("*/setup.py"), *self.root.glob("*/*/setup.py")]):
+            text = setup.read_text(encoding="utf-8", errors="replace")
+            if (setup.parent / package).is_dir() or re.search(rf"""["']{re.escape(package)}["'.]""", text):
+                return OwnPackage(setup.parent, "CUDAExtension" in text)
+        return None
 
     @property
     def rasterizer_modules(self) -> tuple[str, ...]:

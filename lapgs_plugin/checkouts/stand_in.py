@@ -31,12 +31,14 @@ def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     known = [name for name, each in VARIANTS.items() if each.module in modules]
     known.sort(key=lambda name: len(VARIANTS[name].functions) + len(VARIANTS[name].beside))
     names = dict.fromkeys([preferred, *known] if preferred else known)
-    lacks = {name: [] if source is None else list(_lacks(name, source)) for name in names}
+    lacks = {name: {} if source is None else dict.fromkeys(_lacks(name, source)) for name in names}
     near = min(lacks, key=lambda name: len(lacks[name]), default="")
-    found = [*lacks.get(near, ()), *_unreturned(near, uses)]
+    found = [*lacks.get(near, ()), *dict.fromkeys(_unreturned(near, uses))]
     if near and not found:
         return near
-    why = f"; the nearest, {near}, {' and '.join(found)}" if near else ""
+    verbs = dict.fromkeys(verb for verb, _ in found)
+    parts = [f"{verb} {', '.join(what for each, what in found if each == verb)}" for verb in verbs]
+    why = f"; the nearest, {near}, {' and '.join(parts)}" if near else ""
     raise MissingExtraError(
         f"no CPU stand-in for {', '.join(modules) or 'a rasterizer'}, imported in "
         f"{', '.join(places) or 'the checkout'}, with the settings, inputs and outputs of the checkout{why}; it needs "
@@ -44,36 +46,36 @@ def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     )
 
 
-def _lacks(variant: str, source: CheckoutSource) -> Iterator[str]:
-    """Yield what a variant, or those beside it, would have to have or take, as ends of sentences."""
+def _lacks(variant: str, source: CheckoutSource) -> Iterator[tuple[str, str]]:
+    """Yield what a variant, or those beside it, would have to have or take: a verb, and a name."""
     offered = _offered(variant)
     for one in source.externals:
         if one.name in offered and not one.optional:
             absent = set(one.names) - rasterizer_module(offered[one.name]).keys() - {"_C"}
-            yield from (f"has no {name}" for name in sorted(absent))
+            yield from (("has no", name) for name in sorted(absent))
     for use in source.rasterizers:
         each = VARIANTS.get(offered.get(use.module, ""))
         if each is None:
-            yield f"has no {use.module}"
+            yield "has no", use.module
             continue
         if not each.settings:  # a module of functions
             continue
         for name in sorted(use.settings - set(each.settings)):
-            yield f"takes no setting {name}"
+            yield "takes no setting", name
         for name in sorted(set(each.settings) - use.settings if use.settings else ()):
-            yield f"wants the setting {name}"
+            yield "wants the setting", name
         forward = rasterizer_module(offered[use.module])["GaussianRasterizer"].forward
         for name in sorted(use.inputs - set(inspect.signature(forward).parameters) - OPTIONAL_INPUTS):
-            yield f"takes no input {name}"
+            yield "takes no input", name
 
 
-def _unreturned(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[str]:
-    """Yield the outputs that a variant would have to return; their number does not tell what they are."""
+def _unreturned(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[tuple[str, str]]:
+    """Yield the outputs that a variant would have to return, as `_lacks`; their number does not tell what they are."""
     offered = _offered(variant) if variant else {}
     for use in uses:
         returned = VARIANTS[offered[use.module]].returned if use.module in offered else None
         if returned is not None and use.outputs > returned:
-            yield f"returns {returned} outputs, not {use.outputs}"
+            yield "returns", f"{returned} outputs, not {use.outputs}"
 
 
 def _offered(variant: str) -> dict[str, str]:

@@ -13,8 +13,9 @@ import typer
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import write_text
+from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.runs.layout import RUN_CONFIG
-from lapgs_plugin.training.strategies import AUTO, GRADIENTS, MCMC
+from lapgs_plugin.training.strategies import GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_toml
 
 OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})

@@ -5,13 +5,15 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.adapters.registry import adapter_class, known_extensions
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
 from lapgs_plugin.environment import is_installed
 from lapgs_plugin.environment.findings import Finding
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+
+README = "install it as the checkout's README says"
 
 COLORS = {"shs", "colors_precomp"}
 """Inputs of rasterizers by which a residual gets colours of both signs."""
@@ -40,8 +42,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             *(Finding("Other scripts", "ok", text) for text in more),
             Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
         ],
-        "Rasterizers": [_rasterizer(use, use.module in source.modules) for use in source.rasterizers]
-        or [Finding("none", "problem", unused)],
+        "Rasterizers": [_rasterizer(use, source) for use in source.rasterizers] or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
         "lapgs run": [*_kinds(source), _stand_in(source)],
@@ -72,14 +73,19 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
     return found[names[0]], names[1:]
 
 
-def _rasterizer(use: RasterizerUse, own: bool) -> Finding:
+def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
     detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
-    if own:
+    if use.module in source.modules:
         return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):
         return Finding(use.module, "ok", detail)
-    return Finding(use.module, "absent", f"not installed; {detail}", "install it as the checkout's README says")
+    return Finding(use.module, "absent", f"not installed; {detail}", _how_to_install(use.module, source, README))
+
+
+def _how_to_install(module: str, source: CheckoutSource, otherwise: str = "") -> str:
+    own = source.own_package(_package(module))
+    return otherwise if own is None else own.install
 
 
 def _packages(source: CheckoutSource) -> list[Finding]:
@@ -89,7 +95,14 @@ def _packages(source: CheckoutSource) -> list[Finding]:
     missing = {name: one for name, one in needed.items() if name not in known and not is_installed(name)}
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
-    return [Finding(name, "absent", f"{one.where} imports it; not installed") for name, one in sorted(missing.items())]
+    return [
+        Finding(name, "absent", f"{one.where} imports it; not installed", _how_to_install(name, source))
+        for name, one in sorted(missing.items())
+    ]
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
 
 
 def _schedule(source: CheckoutSource) -> list[Finding]:
@@ -123,6 +136,12 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
 
 
 def _stand_in(source: CheckoutSource) -> Finding:
+    stood_in = {*map(_package, known_extensions()), *map(_package, source.rasterizer_modules)}
+    for one in source.externals:
+        own = None if one.optional or _package(one.name) in stood_in else source.own_package(_package(one.name))
+        if own is not None and own.needs_cuda and not is_installed(_package(one.name)):
+            why = f"no CPU stand-in for {one.name}, which {one.where} imports from {own.folder}; it needs a CUDA device"
+            return Finding("--device cpu", "absent", why)
     try:
         return Finding("--device cpu", "ok", f"stand-in {adapter_class(source.root).stand_in_for(source.root, ())}")
     except MissingExtraError as error:

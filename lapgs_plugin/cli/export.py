@@ -68,12 +68,11 @@ def export(
     ],
     settings: ExportSettings,
 ) -> None:
-    """Export the Gaussians of each level of RUN as PLY or SPZ for other viewers.
+    """Export RUN for other viewers: PLY or SPZ files of its levels, one merged field, or a web page.
 
-    Files are named level_<l>_base, level_<l>_residual or level_<l>_field. The base and nested levels are ordinary
-    fields that open in any 3DGS viewer. A residual of a Laplacian hierarchy is not: its signed colours are added to the
-    upsampled image of the coarser levels, so another viewer cannot show the composition. A comment in the header of its
-    file says so; --merge makes an ordinary field that approximates the composition.
+    Files of levels are named level_<l>_base, level_<l>_residual or level_<l>_field. The base and nested levels are
+    ordinary fields that open in any 3DGS viewer. A residual is not: its signed colours are added to the upsampled image
+    of the coarser levels, which other viewers cannot do; --merge fits an ordinary field to the composition.
 
     Examples:
 

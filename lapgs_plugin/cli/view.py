@@ -36,9 +36,10 @@ def view(
     """Show RUN in a web browser, with a switch and a gain for each frequency band.
 
     Drag to orbit, scroll to zoom, fly with W A S D Q E, or jump to a camera of the scene. The panel sets the gain of
-    each band and the level of detail, and shows residuals around mid-grey and render times. On a CPU, images are small
-    while the camera moves and full-size when it stops. Levels that finish later appear by themselves. Several browsers
-    can connect. Ctrl-C stops the viewer. Needs the extra: pip install 'lapgs_plugin\\[viewer]'.
+    each band and the level of detail, and shows residuals around mid-grey and render times. Where rendering is slow,
+    pictures are small while the camera moves and full-size when it stops. Levels that finish later appear by
+    themselves. Several browsers can connect. Ctrl-C stops the viewer. Needs the extra: pip install
+    'lapgs_plugin\\[viewer]'.
 
     Examples:
 

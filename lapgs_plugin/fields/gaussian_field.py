@@ -54,7 +54,7 @@ class GaussianField:
     signed: bool = False
 
     def __post_init__(self) -> None:
-        n = self.means.shape[0]
+        n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "quaternions": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,)}
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
@@ -184,6 +184,8 @@ def field_from_splats(splats: Mapping[str, Tensor], signed: bool = False) -> Gau
     values = {ours: splats[theirs] for theirs, ours in SPLAT_NAMES.items()}
     if values["opacity_logits"].ndim == 2:
         values["opacity_logits"] = values["opacity_logits"][:, 0]
+    if wrong := [name for name in colors if splats[name].ndim != 3]:
+        raise FieldError(f"{wrong[0]} has shape {tuple(splats[wrong[0]].shape)}, expected (n, coefficients, 3)")
     sh = splats["sh"] if colors == ("sh",) else torch.cat([splats["sh0"], splats["shN"]], 1)
     return GaussianField(**values, sh=sh, signed=signed)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -61,9 +60,10 @@ class Semantics:
     note: str = ""
 
 
-class FieldStack(Protocol):
+class FieldStack(ABC):
     """Hold finished fields on a device, to render them together; see `Rasterizer.stack`."""
 
+    @abstractmethod
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         """Render the first fields, each from its own camera.
 
@@ -75,7 +75,6 @@ class FieldStack(Protocol):
         Returns:
             (3, height, width) of each camera, in PyTorch's current stream.
         """
-        ...
 
 
 class Rasterizer(ABC):
@@ -83,12 +82,20 @@ class Rasterizer(ABC):
 
     Attributes:
         name: in logs, manifests and tables.
+        devices: where the fields can be that it renders, "cuda", "cpu" or both. The first one that a machine has is
+            taken, unless --device says it.
         in_current_stream: whether all its work on a GPU goes to PyTorch's current stream, so that fields can be
             rendered concurrently.
     """
 
     name: str
+    devices: tuple[str, ...] = ("cuda", "cpu")
     in_current_stream: bool = False
+
+    @property
+    def semantics(self) -> Semantics:
+        """Where it differs from the oracle by design, for `lapgs conformance`."""
+        return Semantics()
 
     @abstractmethod
     def __call__(
@@ -98,8 +105,8 @@ class Rasterizer(ABC):
 
         Args:
             field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
-            camera: size, intrinsics and pose.
-            background: (3,) colour behind everything; zero for residual fields.
+            camera: size, intrinsics and pose. The pose may be on another device than the field.
+            background: (3,) colour behind everything, with the field's type and device; zero for residual fields.
             sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
 
         Raises:
@@ -167,6 +174,8 @@ def degree_to_evaluate(field: GaussianField, sh_degree: int | None) -> int:
 
 def require_color(background: Tensor) -> None:
     """Raise a UserInputError unless a background is one colour: CUDA code reads three numbers, whatever its shape."""
+    if not isinstance(background, Tensor):
+        raise UserInputError(f"background is a {type(background).__name__}, expected a (3,) Tensor: one RGB colour")
     if background.shape != (3,):
         raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
 

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import level_size
 
 
 def level_camera(camera: Camera, level: int) -> Camera:
-    """Return the camera of a pyramid level, from the camera of the full-resolution view."""
+    """Return the camera of a pyramid level, from the camera of the full-resolution view.
+
+    Raises:
+        UserInputError: a negative level.
+    """
     return camera.resized(*level_size(camera.size, level))
 
 
@@ -25,7 +30,12 @@ def level_intrinsics(intrinsics: Tensor, size: tuple[int, int], level: int) -> T
 
     Returns:
         (..., 3, 3) with the type and device of `intrinsics`; float32 of integers.
+
+    Raises:
+        UserInputError: another shape, or a negative level.
     """
+    if tuple(intrinsics.shape[-2:]) != (3, 3):
+        raise UserInputError(f"intrinsics of shape {tuple(intrinsics.shape)}: expected (..., 3, 3), matrices K")
     intrinsics = intrinsics if intrinsics.is_floating_point() else intrinsics.float()
     width, height = level_size(size, level)
     factors = intrinsics.new_tensor([width / size[0], height / size[1], 1.0])

@@ -38,15 +38,26 @@ def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> Gaussia
 
     Args:
         points: (n, 3) positions in world units, n at least 1.
-        colors: (n, 3) RGB in [0, 1], the same from every direction.
+        colors: (n, 3) RGB in [0, 1], floats, the same from every direction.
         sh_degree: 0 to 3; coefficients above degree 0 are zero.
 
     Returns:
         A field of n Gaussians, float32, not signed.
 
     Raises:
-        UserInputError: no points, or one is not finite.
+        UserInputError: no points, one is not finite, colours that are not one in [0, 1] for each point, or another
+            degree.
     """
+    _require_degree(sh_degree)
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise UserInputError(
+            f"points {tuple(points.shape)} and colours {tuple(colors.shape)}: expected two tensors (n, 3)"
+        )
+    if len(colors) and not (colors.is_floating_point() and float(colors.amin()) >= 0 and float(colors.amax()) <= 1):
+        low, high = colors.aminmax()
+        raise UserInputError(
+            f"colours of {colors.dtype} from {low:g} to {high:g}: expected floats in [0, 1]; divide levels by 255.0"
+        )
     sh = torch.zeros(len(points), (sh_degree + 1) ** 2, 3, device=points.device)
     sh[:, 0] = (colors.to(sh) - 0.5) / SH_C0
     return _initial_field(points, sh, signed=False)
@@ -80,8 +91,8 @@ def inherit(
         sh_degree: of the new field; None keeps the old one's. "full" can only keep it.
 
     Raises:
-        UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians, or "full" with another
-            `sh_degree`.
+        UserInputError: an unknown mode, a ratio outside (0, 1], a field without Gaussians, a degree that is not 0 to
+            3, or "full" with another `sh_degree`.
     """
     if mode not in INHERIT_MODES:
         raise UserInputError(f"--inherit {mode!r}: expected {', '.join(INHERIT_MODES)}; the ratio is another argument")
@@ -90,6 +101,7 @@ def inherit(
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _sample_rows(len(field), ratio, generator).to(field.means.device)
     degree = field.sh_degree if sh_degree is None else sh_degree
+    _require_degree(degree)
     rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
     if mode == "full":
         if degree != field.sh_degree:
@@ -102,6 +114,11 @@ def inherit(
     if mode == "geometry":
         return Inherited(GaussianField(**{**rows, "sh": sh}, signed=True), kept)
     return Inherited(_initial_field(rows["means"], sh, signed=True), kept)
+
+
+def _require_degree(sh_degree: int) -> None:
+    if not 0 <= sh_degree <= 3:
+        raise UserInputError(f"sh_degree {sh_degree}: expected 0 to 3")
 
 
 def _sample_rows(n: int, ratio: float, generator: torch.Generator | None) -> Tensor:

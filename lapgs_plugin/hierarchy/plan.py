@@ -47,17 +47,33 @@ class Hierarchy(str, Enum):
     LAPLACIAN = "laplacian"
     """A signed residual, added to the upsampled image of the coarser fields: the paper's."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> Hierarchy:
+        """Raise a UserInputError about a value that is none of them."""
+        raise UserInputError(f"--hierarchy {value}: expected {' or '.join(each.value for each in cls)}")
+
 
 DEFAULT_HIERARCHY = Hierarchy.LAPLACIAN
 """Default of every command: the paper's method."""
 
 
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
-    """Return the size (width, height) of a pyramid level: halved `level` times, odd sizes rounded up.
+    """Return the size of a pyramid level: halved `level` times, odd sizes rounded up.
+
+    The sides are independent, so a size given height first is returned height first.
 
     >>> level_size((1063, 533), 1)
     (532, 267)
+
+    Args:
+        size: (width, height) in pixels of level 0.
+        level: at least 0.
+
+    Raises:
+        UserInputError: a negative level.
     """
+    if level < 0:
+        raise UserInputError(f"level {level}: expected 0, the full size, or more")
     width, height = size
     for _ in range(level):
         width, height = (width + 1) // 2, (height + 1) // 2
@@ -147,7 +163,7 @@ class StagePlan:
         iterations: int,
         levels: int = 2,
         split: Sequence[Fraction] | None = None,
-        hierarchy: Hierarchy = Hierarchy.LAPLACIAN,
+        hierarchy: Hierarchy | str = Hierarchy.LAPLACIAN,
     ) -> StagePlan:
         """Make a plan of `levels` levels whose stages share `iterations` by `split`.
 
@@ -157,12 +173,15 @@ class StagePlan:
             levels: number of levels L, at least 1.
             split: share of each stage, coarsest first, summing to 1. None takes `DEFAULT_SPLITS`; with more than four
                 levels, the first and last stage get a third each and the others share the rest evenly.
-            hierarchy: what the fields after the first represent.
+            hierarchy: what the fields after the first represent, also by name: "laplacian" or "nested".
 
         Raises:
-            UserInputError: fewer iterations than levels, shares that are not one positive number per level or do not
-                sum to 1, or a level too small to train.
+            UserInputError: an image without pixels, fewer iterations than levels, shares that are not one positive
+                number per level or do not sum to 1, a level too small to train, or an unknown hierarchy.
         """
+        hierarchy = Hierarchy(hierarchy)
+        if len(image_size) != 2 or min(image_size) < 1:
+            raise UserInputError(f"image size {tuple(image_size)}: expected (width, height) in pixels")
         if levels < 1:
             raise UserInputError(f"--levels {levels}: expected at least 1")
         # Checked first: the rest takes time and memory for every level.

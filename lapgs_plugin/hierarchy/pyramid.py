@@ -37,6 +37,7 @@ class Pyramid:
 
     Images are (..., h, w) of any float type on any device, usually (3, h, w); results have the type and device of their
     argument. Half-precision images are filtered in float32 and rounded once. Everything is linear and differentiable.
+    An image of integers raises UserInputError.
 
     Args:
         grid: "camera" or "even", or "mixed" for runs of the paper authors' release; see the module.
@@ -103,6 +104,10 @@ class Pyramid:
     def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
         """Build the Gaussian pyramid I^0 = `image`, I^(l+1) = Down(I^l), finest first.
 
+        Args:
+            image: (..., h, w).
+            levels: number of images to return, `image` included.
+
         Raises:
             UserInputError: fewer than one level.
         """
@@ -115,6 +120,10 @@ class Pyramid:
 
     def laplacian(self, image: Tensor, levels: int) -> list[Tensor]:
         """Build the Laplacian pyramid R^l = I^l - Up(I^(l+1)) for l < levels - 1, then I^(levels-1); finest first.
+
+        Args:
+            image: (..., h, w).
+            levels: number of images to return: `levels` - 1 residuals and a coarse image.
 
         Raises:
             UserInputError: fewer than one level.
@@ -178,7 +187,8 @@ def _size(image: Tensor) -> tuple[int, int]:
 
 
 def _working_precision(image: Tensor) -> Tensor:
-    assert image.is_floating_point(), f"a pyramid needs floats, got {image.dtype}"
+    if not image.is_floating_point():
+        raise UserInputError(f"an image of {image.dtype}: expected floats; divide levels from 0 to 255 by 255.0")
     return image.float() if image.dtype in (torch.float16, torch.bfloat16) else image
 
 

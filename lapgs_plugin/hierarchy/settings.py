@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
-from lapgs_plugin.options import option
+from lapgs_plugin.options import check_values, option, option_name, require_positive
 
 GRIDS = ("camera", "even")
 """Pixel grids of a pyramid; see `pyramid`."""
@@ -35,11 +34,16 @@ RESIDUAL_COLOR_RATE = 4.0
 PANEL = "Hierarchy"
 STORAGE = "Memory and speed"
 
-ABOUT_RESIDUALS = ("supervision", "inherit", "joint", "residual_color_rate", "residual_threshold", "residual_resets")
-"""Settings that mean nothing for nested levels."""
+IDLE_WITHOUT_RESIDUALS: Mapping[str, object] = {
+    "supervision": RECONSTRUCTED,
+    "inherit": None,
+    "joint": 0.0,
+    "residual_color_rate": None,
+    "residual_threshold": 1.0,
+    "residual_resets": False,
+}
+"""Settings that mean nothing for nested levels, with the value that they may have there besides None."""
 
-
-PROTOCOLS = ("default", "paper")
 PAPER: Mapping[str, object] = {
     "hierarchy": Hierarchy.LAPLACIAN.value,
     "supervision": RECONSTRUCTED,
@@ -69,12 +73,14 @@ class HierarchySettings:
         "image, as in the paper. nested: each level continues training the coarser level's field at the finer size; "
         "the result is one ordinary field.",
         panel=PANEL,
+        choices=tuple(each.value for each in Hierarchy),
     )
     protocol: str = option(
         "default",
         "default: the settings of this program. paper: exactly those of the paper's main tables; options that "
         "contradict them are refused.",
         panel=PANEL,
+        choices=("default", "paper"),
     )
     levels: int = option(
         2,
@@ -103,12 +109,14 @@ class HierarchySettings:
     joint: float | None = option(
         None,
         "Share of each residual level's iterations, at the end, in which the coarser fields are optimized as well; 0 "
-        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
+        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}; 0.5 in `lapgs train` with "
+        "--strategy mcmc.",
         panel=PANEL,
     )
     residual_color_rate: float | None = option(
         None,
-        f"Factor on the SH learning rates of residual levels. Default: {RESIDUAL_COLOR_RATE:g}; the paper's is 1.",
+        f"Factor on the SH learning rates of residual levels. Default: {RESIDUAL_COLOR_RATE:g}; in `lapgs train` with "
+        "--strategy mcmc 1, as in the paper.",
         panel=PANEL,
     )
     coarse_threshold: float | None = option(
@@ -128,6 +136,7 @@ class HierarchySettings:
         "camera",
         "Pixel grid of the image pyramid: camera (aligned with the cameras) or even (every second pixel, as OpenCV).",
         panel=PANEL,
+        choices=GRIDS,
     )
     prune: float = option(
         0.0,
@@ -141,6 +150,7 @@ class HierarchySettings:
         "size.",
         panel=STORAGE,
         names=("--images-on", "--cache"),
+        choices=(AUTO, *PLACES),
     )
     prediction_precision: str = option(
         AUTO,
@@ -148,18 +158,15 @@ class HierarchySettings:
         "on a CPU.",
         panel=STORAGE,
         names=("--prediction-precision", "--cache-precision"),
+        choices=(AUTO, *PRECISIONS),
     )
     seed: int = option(0, "Seed of all random choices of lapgs.")
 
     def __post_init__(self) -> None:
-        _require("--protocol", self.protocol, PROTOCOLS)
+        check_values(self)
         if self.protocol == "paper":
             self._follow_the_paper()
-        kind = self.kind
         SUPERVISIONS[self.supervision]  # raises for an unknown name
-        _require("--grid", self.grid, GRIDS)
-        _require("--images-on", self.images_on, (AUTO, *PLACES))
-        _require("--prediction-precision", self.prediction_precision, (AUTO, *PRECISIONS))
         if self.levels < 1:
             raise UserInputError(f"--levels {self.levels}: expected at least 1")
         if not 0 <= self.seed < 2**32:
@@ -180,9 +187,8 @@ class HierarchySettings:
             ("--coarse-threshold", self.coarse_factor),
             ("--residual-threshold", self.residual_threshold),
         ):
-            if not (factor > 0 and math.isfinite(factor)):
-                raise UserInputError(f"{name} {factor}: expected a positive factor")
-        if kind is Hierarchy.NESTED:
+            require_positive(name, factor, "factor")
+        if self.nested:
             self._refuse_residual_settings()
 
     @property
@@ -196,27 +202,26 @@ class HierarchySettings:
         Raises:
             UserInputError: another value was given.
         """
-        defaults = {each.name: each.default for each in fields(self)}
+        declared = {each.name: each for each in fields(self)}
         for name, value in self.paper_settings.items():
-            if (given := getattr(self, name)) not in (defaults[name], value):
+            if (given := getattr(self, name)) not in (declared[name].default, value):
                 raise UserInputError(
-                    f"--{name.replace('_', '-')} {given} with --protocol paper: the paper has {value}; leave one out"
+                    f"{option_name(declared[name])} {given} with --protocol paper: the paper has {value}; leave one out"
                 )
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
     def _refuse_residual_settings(self) -> None:
-        idle: Mapping[str, object] = {"supervision": RECONSTRUCTED, "joint": 0.0, "residual_threshold": 1.0}
-        for name in ABOUT_RESIDUALS:
-            if (value := getattr(self, name)) not in (None, False, idle.get(name)):
+        for each in fields(self):
+            given = getattr(self, each.name)
+            if each.name in IDLE_WITHOUT_RESIDUALS and given not in (None, IDLE_WITHOUT_RESIDUALS[each.name]):
                 raise UserInputError(
-                    f"--{name.replace('_', '-')} {value}: is about residuals, and nested levels have none; leave it "
-                    f"out, or add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
+                    f"{option_name(each)} {given}: is about residuals, and nested levels have none; leave it out, or "
+                    f"add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
                 )
 
     @property
     def kind(self) -> Hierarchy:
         """The kind of hierarchy."""
-        _require("--hierarchy", self.hierarchy, [each.value for each in Hierarchy])
         return Hierarchy(self.hierarchy)
 
     @property
@@ -282,12 +287,6 @@ class HierarchySettings:
             return None
         first = stage.iterations - round(stage.iterations * self.joint_share) + 1
         return first if first <= stage.iterations else None
-
-
-def _require(name: str, value: str, known: Collection[str]) -> None:
-    """Check that a value is known."""
-    if value not in known:
-        raise UserInputError(f"{name} {value}: expected {' or '.join(known) if len(known) == 2 else ', '.join(known)}")
 
 
 def parse_split(text: str) -> tuple[Fraction, ...]:

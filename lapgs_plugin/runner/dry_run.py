@@ -138,11 +138,10 @@ class DryRun:
             watching.remove()
             self._context.wrapper.rendering = None
             self._context.running.stage = None
-        place = self._adapter.profile.source.place(self._adapter.profile.source.training)
         if stage.iteration == 0:
             raise UserInputError(
-                f"{place}: {stage.call.function.__name__}() began no iteration, expected one call of {CLOCK}, "
-                f"or one step of the positions, an iteration; {OFF}"
+                f"{self._training_place}: {stage.call.function.__name__}() began no iteration, expected one call of "
+                f"{CLOCK}, or one step of the positions, an iteration; {OFF}"
             )
 
     def _scratch_call(self, folder: Path) -> TrainingCall:
@@ -219,6 +218,11 @@ class DryRun:
         if axes != 3:
             raise UserInputError(f"{place}: residuals need three scale axes, found {axes}; {NESTED_WORKS}")
 
+    @property
+    def _training_place(self) -> str:
+        source = self._adapter.profile.source
+        return source.place(source.training)
+
     @torch.no_grad()
     def _evaluate(self, view: Any, image: Tensor) -> None:
         """Measure an image, and say so if that is not possible: the run itself does not need it."""
@@ -236,6 +240,7 @@ class DryRun:
             gaussians._features_dc = torch.nn.Parameter(signs.expand_as(kept[0]).clone())
             gaussians._features_rest = torch.nn.Parameter(torch.zeros_like(rest))
             expected = self._colored(view, gaussians, ColorPath.PRECOMPUTED)
+            self._require_signed(expected[0])
             if rest.shape[1] < NATIVE_COEFFICIENTS:
                 return ColorPath.PRECOMPUTED
             found = self._colored(view, gaussians, ColorPath.NATIVE)
@@ -247,12 +252,23 @@ class DryRun:
         )
         return ColorPath.NATIVE if same else ColorPath.PRECOMPUTED
 
+    def _require_signed(self, image: Tensor) -> None:
+        """Refuse a checkout whose image of negative, positive and negative colours over black is not that."""
+        red, green, blue = image.flatten(1).unbind()
+        if bool((green > 0).any()) and bool(((red < 0) & (blue < 0)).any()):
+            return
+        raise UserInputError(
+            f"{self._training_place}: colours of both signs do not "
+            "come out of the checkout's renderer, expected that it passes the model's SH on to its rasterizer; a "
+            f"residual could not subtract; {NESTED_WORKS}"
+        )
+
     def _colored(self, view: Any, gaussians: Any, path: ColorPath) -> tuple[Tensor, Tensor]:
         """Return the image of a residual and the gradient of its sum by the first SH coefficients."""
         with torch.enable_grad():
             image = self._render(view, gaussians, path)
-            (gradient,) = torch.autograd.grad(image.sum(), gaussians._features_dc)
-        return image.detach(), gradient
+            (gradient,) = torch.autograd.grad(image.sum(), gaussians._features_dc, allow_unused=True)
+        return image.detach(), torch.zeros_like(gaussians._features_dc) if gradient is None else gradient
 
     @contextmanager
     def _step(self, what: str, expected: str, works: str) -> Iterator[None]:

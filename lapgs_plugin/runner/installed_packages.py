@@ -60,21 +60,23 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
     purpose = next((why for name, why in known_extensions().items() if _package(name) == package), None)
     try:
         source = CheckoutSource.read(script)
-        imports, rasterizers = source.externals, source.rasterizer_modules
+        imports, rasterizers, own = source.externals, source.rasterizer_modules, source.own_package(package)
     except (UserInputError, OSError):
-        imports, rasterizers = (), ()
+        imports, rasterizers, own = (), (), None
     where = next((one.where for one in imports if _package(one.name) == package), None)
     if not package or (purpose is None and where is None):
         return None
     named = f", the {purpose}" if purpose else ""
     problem = f"{where or script} needs {package}{named}, which cannot be imported ({first_line(error)})"
-    if purpose is None and package not in map(_package, rasterizers):
-        return MissingExtraError(f"{problem}: pip install {DISTRIBUTIONS.get(package, package)}")
-    if on_cpu:
+    ours = purpose is not None or package in map(_package, rasterizers)
+    if on_cpu and (ours or (own is not None and own.needs_cuda)):
         return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA")
+    if not ours:
+        install = f"pip install {DISTRIBUTIONS.get(package, package)}" if own is None else own.install
+        return MissingExtraError(f"{problem}: {install}")
+    how = "install it as the checkout's README says" if own is None else own.install
     return MissingExtraError(
-        f"{problem}; install it as the checkout's README says, or run on CPU stand-ins with `lapgs run --device cpu`, "
-        "if `lapgs doctor CHECKOUT` finds one"
+        f"{problem}; {how}, or run on CPU stand-ins with `lapgs run --device cpu`, if `lapgs doctor CHECKOUT` finds one"
     )
 
 

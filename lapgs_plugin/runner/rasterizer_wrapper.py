@@ -8,7 +8,8 @@ with: its matrices may be copied, moved or made anew on the way to the rasterize
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import wraps
 from types import ModuleType
 from typing import Any
@@ -22,6 +23,23 @@ from lapgs_plugin.runner.signed_calls import signed_settings
 from lapgs_plugin.runner.stage_rendering import StageRendering
 
 
+@dataclass(frozen=True)
+class _RendererCall:
+    """Hold what a renderer was called with, and whether it has rasterized the model's colours.
+
+    Attributes:
+        function: the renderer.
+        key: key of the view; None for other cameras.
+        given: values of each Gaussian (n, k) among its arguments, such as colours to render instead.
+        done: not empty once the model's colours were rasterized.
+    """
+
+    function: Callable[..., Any] | None = None
+    key: str | None = None
+    given: tuple[Tensor, ...] = ()
+    done: list[bool] = field(default_factory=list)
+
+
 class RasterizerWrapper:
     """Make the replacements of a checkout's renderers, and of its rasterizers' settings, classes and functions.
 
@@ -30,15 +48,13 @@ class RasterizerWrapper:
 
     Attributes:
         rendering: how the running stage is rendered; None leaves every call unchanged.
-        noted: key of the view that is being rendered; None outside of the renderers, and for other cameras.
-        given: values of each Gaussian (n, k) that the renderer was called with, such as colours to render instead.
+        running: the renderer's call that is running; outside of the renderers one of no view.
     """
 
     def __init__(self, mark: Callable[[str], None] = lambda part: None) -> None:
         self._mark = mark
         self.rendering: StageRendering | None = None
-        self.noted: str | None = None
-        self.given: tuple[Tensor, ...] = ()
+        self.running = _RendererCall()
         self._zeros: Tensor | None = None
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -46,15 +62,20 @@ class RasterizerWrapper:
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
-            outer, given = (self.noted, self.given), (*args, *kwargs.values())
-            self.noted = next((key for v in given if (key := view_key(v)) is not None), self.noted)
-            self.given = (*self.given, *(v for v in given if isinstance(v, Tensor) and v.ndim == 2))
+            outer, given = self.running, (*args, *kwargs.values())
+            key = next((key for v in given if (key := view_key(v)) is not None), outer.key)
+            values = tuple(v for v in given if isinstance(v, Tensor) and v.ndim == 2)
+            self.running = _RendererCall(original, key, (*outer.given, *values))
             try:
                 return original(*args, **kwargs)
             finally:
-                self.noted, self.given = outer
+                self.running = outer
 
         return render
+
+    def renderers(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
+        """Return where a checkout holds its renderers, as owners and names, each with its replacement's maker."""
+        return [(*place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the settings' constructor."""
@@ -65,8 +86,8 @@ class RasterizerWrapper:
             rendering = self.rendering
             if rendering is None:
                 return settings
-            if self.noted is not None and self.noted in rendering.views:
-                rendering.prefetch(self.noted)
+            if (key := self.running.key) is not None and key in rendering.views:
+                rendering.prefetch(key)
             return signed_settings(settings, rendering.path, self._zero_background) if rendering.signed else settings
 
         return make_settings
@@ -105,7 +126,7 @@ class RasterizerWrapper:
 
         The image is that of the stage if the rasterizer renders the model's colours.
         """
-        rendering, noted, given = self.rendering, self.noted, self.given
+        rendering, running = self.rendering, self.running
         assert rendering is not None, "calls outside of stages are left as they are"
 
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
@@ -114,10 +135,9 @@ class RasterizerWrapper:
                 self._mark("loss")
                 return outputs
 
-            colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
-            if any(color is each for color in colors for each in given):
+            if not _has_model_colors(inputs, running, rendering.renderers_of_sh):
                 return rendering.render_other(marked, inputs, settings)
-            return rendering.render(marked, inputs, settings, noted)
+            return rendering.render(marked, inputs, settings, running.key)
 
         return call
 
@@ -126,6 +146,29 @@ class RasterizerWrapper:
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, renderers_of_sh: set[Any]) -> bool:
+    """Return whether a rasterizer renders the model's colours, and not depths, opacities or features in their place.
+
+    The model's colours are its SH, or colours that the renderer evaluates them to. Then they are the first that it
+    renders: forks rasterize other values beside the image.
+
+    Args:
+        inputs: of the rasterizer.
+        running: the renderer's call in which it is called; noted there if these are the model's colours.
+        renderers_of_sh: renderers that have passed on SH; a renderer is added where it does.
+    """
+    colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
+    if running.function is not None:
+        if not colors:
+            renderers_of_sh.add(running.function)
+        elif running.done or running.function in renderers_of_sh:
+            return False
+    if any(color is each for color in colors for each in running.given):
+        return False
+    running.done.append(True)
+    return True
 
 
 class WrappedRasterizer:

@@ -76,7 +76,7 @@ class StageReplacements:
     def _in_rendering(self, profile: Profile) -> list[Replacement]:
         consumer = "the training loop, score functions and reports"
         wrapper = self._context.wrapper
-        found = [(*place, wrapper.renderer) for function in profile.renderers for place in profile.holders(function)]
+        found = wrapper.renderers(profile)
         for rasterizer in profile.rasterizers:
             for name in rasterizer.settings:
                 found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
-from lapgs_plugin.options import option
+from lapgs_plugin.options import option, require_positive
 
 IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
 """Settings that the manifest has fields of its own for."""
@@ -55,8 +53,7 @@ class RunSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.sh_rate > 0 and math.isfinite(self.sh_rate)):
-            raise UserInputError(f"--sh-rate {self.sh_rate}: expected a positive factor")
+        require_positive("--sh-rate", self.sh_rate, "factor")
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -18,6 +19,8 @@ from lapgs_plugin.runner.object_values import fields_of, matrix_keys, size_of
 from lapgs_plugin.runner.raster_outputs import RasterOutputs
 from lapgs_plugin.runner.signed_calls import with_signed_colors
 from lapgs_plugin.runs.level_images import LevelImages
+
+logger = logging.getLogger(__name__)
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
@@ -48,6 +51,7 @@ class StageRendering:
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
         capture: keep the last composed image, before exposure or clamping, in `captured`, and the rasterizer's inputs.
+        renderers_of_sh: renderers that have passed the model's SH on to a rasterizer.
     """
 
     signed: bool
@@ -61,6 +65,8 @@ class StageRendering:
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
     inputs: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    renderers_of_sh: set[Any] = field(default_factory=set, repr=False)
+    _told: bool = field(default=False, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 
     def key(self, noted: str | None, settings: Any) -> str | None:
@@ -150,7 +156,7 @@ class StageRendering:
             image = self.on_image(key, image, below)
         if self.images is not None and key in self.masked and not self.capture:
             # Whatever the loop's loss is, it compares the target with itself outside of the mask.
-            image = fill_outside(image, self.target(key), self.images.get_weights([key]))
+            image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
     def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
@@ -166,7 +172,7 @@ class StageRendering:
     def render_other(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any) -> Any:
         """Return the outputs for colours that are not the model's, such as features or scores, as they are.
 
-        Nothing of the photos belongs into such an image.
+        Nothing of the photos belongs into such an image. Of a residual it is its own only, of which a warning tells.
 
         Raises:
             UserInputError: in the backward pass of a residual's: it is no image of the whole scene.
@@ -174,6 +180,13 @@ class StageRendering:
         outputs = rasterizer(**inputs)
         if not self.signed:
             return outputs
+        if self.images is not None and not (self.capture or self._told):
+            self._told = True
+            logger.warning(
+                "the checkout also renders other values than colours, such as depths or opacities; in a residual they "
+                "are those of its own Gaussians, not the scene's: leave out options that use them, or train with "
+                "--hierarchy nested"
+            )
         found = RasterOutputs.of(outputs, size_of(settings))
         image = found.image.clone()  # the hook is to see uses of this image alone
         if image.requires_grad:
@@ -194,9 +207,9 @@ class StageRendering:
 
 def _refuse_other_colors(_: Tensor) -> None:
     raise UserInputError(
-        "the checkout trains on an image of other colours than the model's, which it gives to its renderer; a "
-        "residual covers a part of the scene only, so its image of them is not the whole one: train with --hierarchy "
-        "nested"
+        "the checkout trains on an image of other colours than the model's, such as depths or features; a residual "
+        "covers a part of the scene only, so its image of them is not the whole one: leave the option out that asks "
+        "for it, or train with --hierarchy nested"
     )
 
 

@@ -170,7 +170,7 @@ class RunArchive(RunFiles):
         Args:
             record: of the level `manifest.next_level`; the seconds that writing takes are added to its overhead as
                 "archive".
-            field: as trained.
+            field: as trained, on any device.
             optimizer_state: for full inheritance, the state that `optimizer_state` returns to the next level; kept
                 until that one is finished.
             trained_along: finished fields after joint training, by level, each with as many Gaussians as before.
@@ -178,10 +178,17 @@ class RunArchive(RunFiles):
             poses: corrections of their poses; None without refinement.
 
         Raises:
-            FieldError: a field holds NaN or inf; nothing is written.
-            RunFolderError: a level of `trained_along` is not finished; nothing is written.
+            FieldError: a field holds NaN or inf, or is not the one that its record describes; nothing is written.
+            RunFolderError: another level is the next one, a level of `trained_along` is not finished, or the run was
+                opened for reading; nothing is written.
         """
         self._require_lock()
+        if record.level != self._manifest.next_level:
+            expected = "no more" if self._manifest.next_level is None else f"level {self._manifest.next_level}"
+            raise RunFolderError(
+                f"{self._folder}: level {record.level} cannot be finished now, expected {expected}; levels are "
+                "finished once each, coarsest first, and a resumed loop skips those in available_levels"
+            )
         trained_along = trained_along or {}
         _require_field_of(record, field)
         for level, thawed in trained_along.items():
@@ -348,9 +355,16 @@ def _require_field_of(record: LevelRecord, field: GaussianField) -> None:
     """Check that a field belongs to a record and is finite.
 
     Raises:
-        FieldError: it holds NaN or inf.
+        FieldError: it does not, or holds NaN or inf.
     """
-    assert (len(field), field.signed) == (record.num_gaussians, record.signed), "the record is of another field"
+    if field.signed != record.signed:
+        kinds = {True: "a residual (signed)", False: "an ordinary field (not signed)"}
+        raise FieldError(
+            f"level {record.level} is {kinds[field.signed]}, its record says {kinds[record.signed]}; make the field "
+            "with signed=stage.signed"
+        )
+    if len(field) != record.num_gaussians:
+        raise FieldError(f"level {record.level} has {len(field)} Gaussians, its record says {record.num_gaussians}")
     try:
         field.require_finite()
     except FieldError as error:

@@ -120,7 +120,7 @@ class ImageStore:
         folder: for "disk", the folder of the files; made here and removed by `close`.
 
     Raises:
-        UserInputError: an unknown place or precision, or "gpu" without one.
+        UserInputError: an unknown place or precision, "gpu" without one, or "disk" without a folder.
     """
 
     def __init__(
@@ -131,7 +131,8 @@ class ImageStore:
             raise UserInputError(f"images cannot be kept on {where}: expected {' or '.join(places)}")
         if precision not in PRECISIONS:
             raise UserInputError(f"images cannot be stored as {precision}: expected {', '.join(PRECISIONS)}")
-        assert where != "disk" or folder is not None, "a store on disk needs a folder"
+        if where == "disk" and folder is None:
+            raise UserInputError("images on disk: expected the folder to write them to; pass folder=")
         self._where = where
         self._dtype = DTYPES[precision]
         self._device = torch.device(device)
@@ -157,8 +158,12 @@ class ImageStore:
         Raises:
             TrainingDivergedError: it holds NaN or inf, or values beyond float16 if that is the precision.
             RunFolderError: the disk is full or the folder not writable.
-            UserInputError: there is not enough memory to page-lock.
+            UserInputError: it is not of floats, or there is not enough memory to page-lock.
         """
+        if not image.is_floating_point():
+            raise UserInputError(
+                f"the image of view {name} is of {image.dtype}: expected floats; divide levels from 0 to 255 by 255.0"
+            )
         encoded, low, divisor = self._encode(name, image.detach())
         if (coming := self._coming.pop(name, None)) is not None:
             wait([coming])
@@ -183,42 +188,34 @@ class ImageStore:
         if len(self._coming) > AHEAD:
             self._coming.pop(next(iter(self._coming))).cancel()
 
-    def get(self, name: str) -> Tensor:
+    def get(self, *names: str) -> Tensor:
         """Return an image on the device, float32, for the current stream. Do not modify it.
 
         The processor waits only for a file that is still being read.
 
         Args:
-            name: of the view.
+            names: of the view, or of several of one size, which are decoded together if they are encoded alike.
+
+        Returns:
+            (c, h, w) of one view, (b, c, h, w) of several.
 
         Raises:
             KeyError: there is no such image.
             RunFolderError: its file cannot be read any more.
         """
-        return _decode(self._arrived(name), self._images[name])
-
-    def get_batch(self, names: Sequence[str]) -> Tensor:
-        """Return several images of one size (b, c, h, w), decoded together if they are encoded alike; see `get`."""
-        images = [self._images[name] for name in names]
-        first = images[0]
-        if any(image.low != first.low or image.divisor is not first.divisor for image in images):
+        first, *others = (self._images[name] for name in names)
+        if any(image.low != first.low or image.divisor is not first.divisor for image in others):
             return torch.stack([self.get(name) for name in names])
-        return _decode(torch.stack([self._arrived(name) for name in names]), first)
+        return _decode(self._all_arrived(names), first)
 
-    def get_stored(self, names: Sequence[str]) -> Tensor:
-        """Return images of one size as they are stored where that is float16, or levels k of k / 255 as uint8.
+    def get_stored(self, *names: str) -> Tensor:
+        """Return what `get` does, but float16, and levels k of k / 255 as uint8, as they are stored.
 
-        Their bytes are a half or a quarter of those that `get` returns. All others are decoded.
-
-        Args:
-            names: of the views; for one the result is (c, h, w), for several (b, c, h, w).
+        Their bytes are a half or a quarter of those that `get` returns.
         """
-        images = [self._images[name] for name in names]
-        as_stored = all(image.divisor is None or image.divisor is self._255 for image in images)
-        if not as_stored:
-            return self.get(names[0]) if len(names) == 1 else self.get_batch(names)
-        stored = [self._arrived(name) for name in names]
-        return stored[0] if len(names) == 1 else torch.stack(stored)
+        divisors = [self._images[name].divisor for name in names]
+        as_stored = all(divisor is None or divisor is self._255 for divisor in divisors)
+        return self._all_arrived(names) if as_stored else self.get(*names)
 
     @property
     def where(self) -> str:
@@ -254,6 +251,11 @@ class ImageStore:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _all_arrived(self, names: Sequence[str]) -> Tensor:
+        """Return the stored bytes of images on the device, with a leading dimension if there are several."""
+        stored = [self._arrived(name) for name in names]
+        return stored[0] if len(stored) == 1 else torch.stack(stored)
 
     def _arrived(self, name: str) -> Tensor:
         """Return the stored bytes of an image on the device, for the current stream."""

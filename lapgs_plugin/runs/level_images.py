@@ -76,14 +76,10 @@ class HeldImages:
     def prefetch(self, name: str) -> None:
         """Do nothing: images are on the device."""
 
-    def get(self, name: str) -> Tensor:
-        return self._images[name]
+    def get(self, *names: str) -> Tensor:
+        return self._images[names[0]] if len(names) == 1 else torch.stack([self._images[name] for name in names])
 
-    def get_batch(self, names: Sequence[str]) -> Tensor:
-        return torch.stack([self._images[name] for name in names])
-
-    def get_stored(self, names: Sequence[str]) -> Tensor:
-        return self._images[names[0]] if len(names) == 1 else self.get_batch(names)
+    get_stored = get
 
     def close(self) -> None:
         self._images.clear()
@@ -157,19 +153,13 @@ class LevelImages:
         for store in self.stores:
             store.prefetch(name)
 
-    def get(self, name: str) -> tuple[Tensor, Tensor | None]:
-        """Return I^l (3, h, w) of a view, and Up(I^(l+1)) or None."""
-        return self.targets.get(name), None if self.coarse is None else self.coarse.get(name)
+    def get(self, *names: str) -> tuple[Tensor, Tensor | None]:
+        """Return I^l of views as `ImageStore.get` does, and Up(I^(l+1)) or None."""
+        return self.targets.get(*names), None if self.coarse is None else self.coarse.get(*names)
 
-    def get_batch(self, names: Sequence[str]) -> tuple[Tensor, Tensor | None]:
-        """Return both (b, 3, h, w) for several views of one size."""
-        return self.targets.get_batch(names), None if self.coarse is None else self.coarse.get_batch(names)
-
-    def get_weights(self, names: Sequence[str]) -> Tensor | None:
+    def get_weights(self, *names: str) -> Tensor | None:
         """Return the weights (1, h, w) of a view or (b, 1, h, w) of several; None without masks."""
-        if self.weights is None:
-            return None
-        return self.weights.get_batch(names) if len(names) > 1 else self.weights.get(names[0])
+        return None if self.weights is None else self.weights.get(*names)
 
     @property
     def stores(self) -> Iterable[ImageStore | HeldImages]:

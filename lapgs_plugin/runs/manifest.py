@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveInt
 from typing_extensions import NotRequired
@@ -14,8 +14,12 @@ from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST, require_manifest
-from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Stage
+from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Hierarchy, Stage
+from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.untrusted import STRICT, StrictWithMore, checked, read_json, shortened, usable_path
+
+if TYPE_CHECKING:
+    from lapgs_plugin.scenes.scene import Scene
 
 FORMAT_VERSION = 1
 ADVICE = "restore it or train again with --overwrite"
@@ -69,6 +73,20 @@ class SceneReference:
     images: PathText = "images"
     masks: PathText = "none"
 
+    @classmethod
+    def of(
+        cls, scene: Scene, *, resolution: str = "full", images: str = "images", masks: str = "none"
+    ) -> SceneReference:
+        """Return the reference of a loaded scene, for the manifest of your own loop.
+
+        Args:
+            scene: as `load_scene` returned it. Views were held out if it has any.
+            resolution, images: as they were given to `load_scene`.
+            masks: "none" for a loop that ignores masks, "alpha", or the folder of masks.
+        """
+        path = str(scene.path.absolute())
+        return cls(path, resolution, bool(scene.test), scene.background, scene.kind, images, masks)
+
 
 @dataclass(frozen=True)
 class LevelRecord:
@@ -107,7 +125,13 @@ class LevelRecord:
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:
-        """Return the record of a stage that your own loop trained and that only measured its time."""
+        """Return the record of a stage that your own loop trained and that only measured its time.
+
+        Args:
+            stage: of the plan.
+            field: as trained.
+            train_seconds: of the iterations alone; shown by `lapgs eval` and `lapgs report`.
+        """
         n = len(field)
         return cls(stage.level, stage.signed, stage.iterations, n, n, train_seconds, {}, stage.image_size)
 
@@ -168,6 +192,7 @@ class Manifest:
         levels: int,
         rasterizer: str,
         *,
+        hierarchy: Hierarchy | str = Hierarchy.LAPLACIAN,
         grid: str = "camera",
         inherit: str = "geometry",
         sh_degree: int = 3,
@@ -175,8 +200,30 @@ class Manifest:
         """Return the manifest of a run that your own loop trains, supervised by composed images.
 
         Such a run is rendered and measured like any other; `lapgs train --resume` does not continue it.
+
+        Args:
+            scene: the images, see `SceneReference.of`.
+            levels: number of levels, 1 to 24.
+            rasterizer: that renders the run best, as `--rasterizer` names it: "gsplat", "cpu", or the module of an
+                extension. Where it is not available, the most similar one renders.
+            hierarchy: what finer levels are, "laplacian" or "nested".
+            grid: of the loop's `Pyramid`, "camera" or "even".
+            inherit: how residuals started, "geometry", "xyz" or "full".
+            sh_degree: highest of the fields, 0 to 3.
+
+        Raises:
+            UserInputError: one of these is something else.
         """
-        return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings={})
+        if not isinstance(scene, SceneReference):
+            raise UserInputError(
+                f"scene is a {type(scene).__name__}, expected a SceneReference; SceneReference.of makes it"
+            )
+        if grid not in GRIDS:
+            raise UserInputError(f"grid {grid}: expected {' or '.join(GRIDS)}")
+        if not 0 <= sh_degree <= 3:
+            raise UserInputError(f"sh_degree {sh_degree}: expected 0 to 3")
+        settings = {"hierarchy": Hierarchy(hierarchy).value}
+        return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings=settings)
 
     @property
     def complete(self) -> bool:

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.files import FolderLock, one_line_errors, write_text
 from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
@@ -56,10 +56,22 @@ class RunFiles:
         return self._folder.joinpath(*parts)
 
     def append_history(self, entry: dict[str, Any]) -> None:
-        """Append one entry to the history: JSON with finite numbers, with "level" and "iteration"."""
+        """Append one entry to the history: JSON with finite numbers.
+
+        Args:
+            entry: "level" and "iteration" within its stage; `lapgs report` draws "elapsed" (seconds of optimization in
+                the run), "loss", "num_gaussians" and "psnr".
+
+        Raises:
+            UserInputError: it has no level or iteration, or a number that is not finite.
+        """
         self._require_lock()
-        assert {"level", "iteration"} <= entry.keys(), "a history entry says where in the run it belongs"
-        line = json.dumps(entry, allow_nan=False) + "\n"
+        if missing := {"level", "iteration"} - entry.keys():
+            raise UserInputError(f"a history entry without {' and '.join(sorted(missing))}: it says where it belongs")
+        try:
+            line = json.dumps(entry, allow_nan=False) + "\n"
+        except (ValueError, TypeError) as error:
+            raise UserInputError(f"history entry {shortened(entry)}: {error}; expected finite numbers") from None
         path = self.path(HISTORY)
         with one_line_errors(path, training=True), path.open("a", encoding="utf-8") as stream:
             stream.write(line)
@@ -105,8 +117,12 @@ class RunFiles:
         """Replace the checkpoint of the level in training.
 
         Args:
-            state: as `tensors.write_tensors` takes it.
+            state: tensors, numbers, text and None by name, and lists, tuples and dictionaries of them, such as
+                state_dict() of an optimizer. `load_checkpoint` returns it with its tensors on the CPU.
             extends_to: of a finished run that is trained further, the number of iterations that it will have.
+
+        Raises:
+            UserInputError: something in the state cannot be read again; the old checkpoint stays.
         """
         self._require_lock()
         level = self._manifest.next_level
@@ -161,4 +177,8 @@ class RunFiles:
                 self.path(name).unlink(missing_ok=True)
 
     def _require_lock(self) -> None:
-        assert self._lock is not None, "open the run with resume=True to write to it"
+        if self._lock is None:
+            raise RunFolderError(
+                f"{self._folder} is open for reading, expected a folder open for writing; open it with "
+                "RunArchive.open(folder, resume=True)"
+            )

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import zipfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lapgs_plugin.errors import RunFolderError, first_line
+from lapgs_plugin.errors import RunFolderError, UserInputError, first_line
 from lapgs_plugin.files import atomic_write, one_line_errors
+
+PLAIN = (int, float, complex, bool, str, bytes, type(None), torch.dtype, torch.device)
+"""Types besides tensors and containers that a checkpoint may hold."""
 
 
 def write_tensors(path: Path, state: dict[str, Any]) -> None:
@@ -17,7 +21,9 @@ def write_tensors(path: Path, state: dict[str, Any]) -> None:
 
     Raises:
         RunFolderError: the disk is full or the folder is not writable; the file stays as it was.
+        UserInputError: `state` holds an object that `read_tensors` refuses; the file stays as it was.
     """
+    _require_readable(state, path)
     with one_line_errors(path, training=True), atomic_write(path) as stream:
         try:
             torch.save(state, stream)
@@ -41,11 +47,37 @@ def read_tensors(path: Path, advice: str) -> dict[str, Any]:
         _require_stored(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # RuntimeError, UnpicklingError, EOFError, OSError, ...: it depends on the damage
-        raise RunFolderError(f"{path} cannot be read ({first_line(error)}); {advice}") from error
+        code = "Weights only load failed" in str(error)  # PyTorch's advice is to load it all the same, code included
+        reason = "it is damaged or holds other objects than tensors, numbers and text" if code else first_line(error)
+        raise RunFolderError(f"{path} cannot be read ({reason}); {advice}") from error
     if not isinstance(state, dict):
         raise RunFolderError(f"{path} holds a {type(state).__name__}, expected a dictionary; {advice}")
     _require_held(state, path, advice)
     return state
+
+
+def _require_readable(state: dict[str, Any], path: Path) -> None:
+    """Check that every object in a dictionary is of a type that `torch.load` makes without executing code.
+
+    Raises:
+        UserInputError: one is not; the line says where it is.
+    """
+    waiting: list[tuple[str, Any]] = [("state", state)]
+    seen: set[int] = set()
+    while waiting:
+        place, each = waiting.pop()
+        if type(each) in PLAIN or isinstance(each, torch.Tensor) or id(each) in seen:
+            continue
+        seen.add(id(each))
+        if type(each) in (dict, OrderedDict):
+            waiting.extend((f"{place}[{key!r}]", part) for key, value in each.items() for part in (key, value))
+        elif type(each) in (list, tuple, set, torch.Size):
+            waiting.extend((f"{place}[{index}]", part) for index, part in enumerate(each))
+        else:
+            raise UserInputError(
+                f"{path}: {place} is a {type(each).__name__}, expected tensors, numbers, text, None, and dictionaries "
+                "and lists of them; convert it first"
+            )
 
 
 def _require_stored(path: Path) -> None:

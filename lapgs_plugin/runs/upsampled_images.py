@@ -48,16 +48,16 @@ class UpsampledImages:
         self.store.prefetch(name)
 
     @torch.no_grad()
-    def get(self, name: str) -> Tensor:
-        """Return Up of an image (c, h, w) on the device, float32, a new tensor in every call; see `ImageStore.get`."""
-        return upsample(self.pyramid, self.store.get(name), self._sizes[name])
+    def get(self, *names: str) -> Tensor:
+        """Return Up of an image, or of several in as many launches, as a new tensor; see `ImageStore.get`."""
+        return upsample(self.pyramid, self.store.get(*names), self._sizes[names[0]])
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return what adds Up of the images of some views, of one size, to (c, h, w) or for several (b, c, h, w).
 
         Until then they are as small as they are stored.
         """
-        stored = self.store.get_stored(names)
+        stored = self.store.get_stored(*names)
         if stored.dtype == torch.uint8:
             stored = stored.div(255)
         return partial(upsample_add, self.pyramid, stored)
@@ -65,8 +65,3 @@ class UpsampledImages:
     def close(self) -> None:
         """Drop all images and remove the files."""
         self.store.close()
-
-    @torch.no_grad()
-    def get_batch(self, names: Sequence[str]) -> Tensor:
-        """Return Up of several images of one size (b, c, h, w), in as many launches as for one; see `get`."""
-        return upsample(self.pyramid, self.store.get_batch(names), self._sizes[names[0]])

@@ -5,10 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from pydantic import ConfigDict, NonNegativeFloat, NonNegativeInt, PositiveInt, TypeAdapter, ValidationError
+from pydantic import (
+    AllowInfNan,
+    ConfigDict,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
 from torch import Tensor
 from typing_extensions import NotRequired, TypedDict
 
@@ -24,6 +32,7 @@ MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
 _STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 
 Moments = dict[str, dict[str, Tensor]]
+Seconds = Annotated[NonNegativeFloat, AllowInfNan(False)]
 
 
 class _State(TypedDict):
@@ -34,7 +43,7 @@ class ProgressState(_State):
     """State of a `stage_progress.StageProgress`; the loss is NaN before the first iteration."""
 
     iteration: NonNegativeInt
-    seconds: NonNegativeFloat
+    seconds: Seconds
     loss: float
     peak_gaussians: NonNegativeInt
     gaussian_steps: NonNegativeInt
@@ -74,7 +83,7 @@ class StageState(_State):
 
     level: NonNegativeInt
     progress: ProgressState
-    breakdown: NotRequired[dict[str, NonNegativeFloat]]
+    breakdown: NotRequired[dict[str, Seconds]]
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
@@ -83,7 +92,7 @@ class StageState(_State):
     best: NotRequired[BestState]
     random: Tensor
     random_gpu: NotRequired[Tensor]
-    overhead: dict[str, NonNegativeFloat]
+    overhead: dict[str, Seconds]
 
 
 def check_checkpoint(
@@ -145,7 +154,7 @@ def check_transforms(state: TransformsState | None, shape: torch.Size | None, na
     Args:
         state: from a checkpoint; None without transforms.
         shape: of the transforms; None if the run has none.
-        name: "exposure" or "poses", for the message.
+        name: of the state in the checkpoint, for the message.
         path: of the checkpoint, for the message.
 
     Raises:
@@ -153,10 +162,14 @@ def check_transforms(state: TransformsState | None, shape: torch.Size | None, na
     """
     if state is None and shape is None:
         return
-    tensors = [] if state is None else [state["transforms"], state["gradient"], *state["moments"].values()]
-    right = state is not None and shape is not None and state["moments"].keys() in (set(), MOMENTS)
-    shapes = ((each, shape if each.ndim else torch.Size([])) for each in tensors if each is not None)
-    if not (right and all(_is_finite(each, wanted, torch.float32) for each, wanted in shapes)):
+    right = (
+        state is not None
+        and _is_finite(state["transforms"], shape, torch.float32)
+        and (state["gradient"] is None or _is_finite(state["gradient"], shape, torch.float32))
+        and state["moments"].keys() in (set(), MOMENTS)
+        and all(_is_moment(key, tensor, shape) for key, tensor in state["moments"].items())
+    )
+    if not right:
         raise RunFolderError(
             f"{path} is damaged: {name} is not the state of transforms for {shape[0] if shape else 0} views; {ADVICE}"
         )
@@ -241,15 +254,21 @@ def _check_moments(moments: Moments, shapes: Mapping[str, torch.Size]) -> None:
         if state and state.keys() != MOMENTS:
             raise ValueError(f"{name} has {', '.join(sorted(state))}, expected {', '.join(sorted(MOMENTS))}")
         for key, tensor in state.items():
-            shape = torch.Size([]) if key == "step" else shapes[name]
-            if not _is_finite(tensor, shape, torch.float32) or (key != "exp_avg" and bool((tensor < 0).any())):
-                raise ValueError(f"{name}.{key} is {_described(tensor)}, expected finite float32 {tuple(shape)}")
+            if not _is_moment(key, tensor, shapes[name]):
+                shape = () if key == "step" else tuple(shapes[name])
+                raise ValueError(f"{name}.{key} is {_described(tensor)}, expected finite float32 {shape}")
 
 
 def _shapes(field: GaussianField) -> dict[str, torch.Size]:
     """Return the shape of each parameter by gsplat's names."""
     values = {theirs: field.parameters[ours].shape for theirs, ours in SPLAT_NAMES.items()}
     return {**values, "sh": field.sh.shape, "sh0": field.sh[:, :1].shape, "shN": field.sh[:, 1:].shape}
+
+
+def _is_moment(key: str, value: Tensor, shape: torch.Size | None) -> bool:
+    """Return whether a tensor can be an entry of Adam's state of a parameter of that shape."""
+    fits = _is_finite(value, torch.Size([]) if key == "step" else shape, torch.float32)
+    return fits and (key == "exp_avg" or not bool((value < 0).any()))
 
 
 def _is_finite(value: Any, shape: torch.Size | None, dtype: torch.dtype) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -24,15 +24,15 @@ class CoarserLevels:
         cached: Up of the previous level's prediction by view name; None for a field that is not a residual.
         joint_from: the iteration from which the finished fields are trained jointly; None if they never are.
         unfreeze: makes them trainable, from their state in a checkpoint or, given None, from the archive.
-        joint: the fields while they are trained jointly; None before.
         breakdown: gets the time in which they are rendered.
+        joint: the fields while they are trained jointly; None before.
     """
 
-    cached: UpsampledImages | None = None
-    joint_from: int | None = None
-    unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields] | None = None
+    cached: UpsampledImages | None
+    joint_from: int | None
+    unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields]
+    breakdown: Breakdown
     joint: JointFields | None = None
-    breakdown: Breakdown = field(default_factory=Breakdown)
 
     def is_joint(self, iteration: int) -> bool:
         """Return whether the fields are trained jointly in an iteration."""
@@ -45,7 +45,6 @@ class CoarserLevels:
 
     def restore(self, states: dict[int, dict[str, Any]] | None) -> None:
         """Train the fields jointly from here on, from a `JointFields.state` or, given None, from the archive."""
-        assert self.unfreeze is not None, "a stage with joint training can unfreeze fields"
         self.joint = self.unfreeze(states)
 
     def prediction(self, names: Sequence[str]) -> Tensor | None:
@@ -53,9 +52,7 @@ class CoarserLevels:
         if self.joint is not None:
             self.breakdown.mark("forward")
             return self.joint.predict(names)
-        if self.cached is None:
-            return None
-        return self.cached.get_batch(names) if len(names) > 1 else self.cached.get(names[0])
+        return None if self.cached is None else self.cached.get(*names)
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return what adds `prediction` to renders of the views."""

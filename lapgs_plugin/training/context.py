@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.hierarchy.pyramid import Pyramid
@@ -42,7 +42,7 @@ class RunContext:
     device: torch.device
     monitor: Monitor
     plan: StagePlan
-    first_field: GaussianField | None = None
+    first_field: GaussianField | None
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -72,5 +72,6 @@ class RunContext:
 
     def restored_model(self, state: dict[str, Any]) -> TrainableField:
         """Return the model of a `TrainableField.state`, on the device."""
-        rates, extent, sparse = self.settings.rates, self.scene.extent, self.settings.sparse_adam
-        return TrainableField.from_state(state, rates, extent, device=self.device, sparse=sparse)
+        model = self.model(field_from_splats(state["params"], state["signed"]))
+        model.restore(state)
+        return model

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
@@ -17,8 +19,18 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Gradients
 
-if TYPE_CHECKING:
-    from lapgs_plugin.training.multiview import ViewScores
+
+@dataclass(frozen=True)
+class ViewScores:
+    """Hold each Gaussian's part in the errors of some views.
+
+    Attributes:
+        pixels: (n,) pixels with large errors that it makes up: its weights alpha T there summed, mean over views.
+        blame: (n,) the same with each view weighted by its loss, scaled to the range from 0 to 1.
+    """
+
+    pixels: Tensor
+    blame: Tensor
 
 
 class DensityControl:
@@ -70,8 +82,13 @@ class DensityControl:
 
         Returns:
             Whether Gaussians were added, removed or reset.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(
+            f"density control {type(self).__qualname__} has no method after_step; it has to edit a field"
+        )
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """Return a term of the loss that makes unneeded Gaussians transparent and small; None if its weights are 0."""
@@ -164,7 +181,12 @@ class Densifier(DensityControl):
     def _gradient(self, result: RenderResult) -> Tensor:
         """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
         gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
-        assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
+        if gradient is None:
+            source = "absgrad2d" if self._strategy.absgrad else "means2d.grad"
+            raise UserInputError(
+                f"--strategy densifies by the RenderResult's {source}, which this rasterizer leaves empty; choose "
+                "--strategy mcmc, which needs none, or another --rasterizer"
+            )
         return gradient
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:

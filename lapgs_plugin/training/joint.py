@@ -44,7 +44,7 @@ class JointFields:
     rasterizer: Rasterizer
     background: Tensor
     pyramid: Pyramid
-    poses: ViewPoses | None = None
+    poses: ViewPoses | None
     _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
     def predict(self, names: Sequence[str]) -> Tensor:
@@ -101,5 +101,5 @@ class JointFields:
         return {level: model.field.detach() for level, model in self.models.items()}
 
     def state(self) -> dict[int, dict[str, Any]]:
-        """Return the state of every model by level, for checkpoints; `TrainableField.from_state` takes one."""
+        """Return the state of every model by level, for checkpoints."""
         return {level: model.state() for level, model in self.models.items()}

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.plan import Stage
@@ -41,39 +42,34 @@ class ViewLosses:
         """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
         return self.images.weights is None and self.hooks.is_plain(self.stage)
 
-    def plain(self, names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
-        """Return what computes the mean loss of some views, in a list, from their renders."""
-        target = self.images.targets.get_stored(names)
+    def plain(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Return what computes the mean loss of some views from their renders."""
+        target = self.images.targets.get_stored(*names)
         compose = self.coarser.adder(names)
+        return lambda rendered: photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)
 
-        def losses(rendered: Tensor) -> list[Tensor]:
-            return [photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)]
-
-        return losses
-
-    def hooked(self, contexts: Sequence[StageContext], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
-        """Return what computes the losses of some views by all hooks, from their renders.
+    def hooked(self, contexts: Sequence[StageContext], names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Return what computes the mean loss of some views by all hooks from their renders.
 
         Args:
             contexts: result of `contexts`.
             names: of the views.
         """
 
-        def losses(rendered: Tensor) -> list[Tensor]:
-            parts = (
-                [(names, rendered)] if len(contexts) == 1 else zip(([name] for name in names), rendered, strict=True)
-            )
-            return [
-                self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
-                for context, (shown, image) in zip(contexts, parts, strict=True)
-            ]
+        def of(context: StageContext, shown: Sequence[str], image: Tensor) -> Tensor:
+            return self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
 
-        return losses
+        def loss(rendered: Tensor) -> Tensor:
+            if len(contexts) == 1:
+                return of(contexts[0], names, rendered)
+            losses = [of(*each) for each in zip(contexts, ([name] for name in names), rendered, strict=True)]
+            return torch.stack(losses).mean()
+
+        return loss
 
     def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
-        several = len(names) > 1
-        target, coarse_target = self.images.get_batch(names) if several else self.images.get(names[0])
+        target, coarse_target = self.images.get(*names)
         context = StageContext(
             stage=self.stage,
             iteration=iterations[-1],
@@ -81,9 +77,9 @@ class ViewLosses:
             target=target,
             accumulated=self.coarser.prediction(names),
             coarse_target=coarse_target,
-            weight=self.images.get_weights(names),
+            weight=self.images.get_weights(*names),
         )
-        if not several or self.hooks.takes_batches:
+        if len(names) == 1 or self.hooks.takes_batches:
             return [context]
 
         def of(images: Tensor | None, index: int) -> Tensor | None:

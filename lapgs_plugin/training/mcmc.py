@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
@@ -17,13 +16,10 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.densification import DensityControl, ViewScores
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Mcmc
-
-if TYPE_CHECKING:
-    from lapgs_plugin.training.multiview import ViewScores
 
 START_SCALE, START_OPACITY = 0.1, 0.5
 """Factor on the sizes, and opacity, of a field that starts from points, as MCMC's authors have them."""

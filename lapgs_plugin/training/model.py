@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -218,23 +218,11 @@ class TrainableField:
             "signed": self.signed,
         }
 
-    @classmethod
-    def from_state(
-        cls,
-        state: dict[str, Any],
-        rates: LearningRates,
-        extent: float,
-        *,
-        device: torch.device | str = "cpu",
-        sparse: bool = False,
-    ) -> TrainableField:
-        """Continue from a result of `state`; `rates`, `extent` and `sparse` as `create` takes them."""
-        field = field_from_splats(state["params"], state["signed"]).to(device)
-        model = cls.create(field, rates, extent, sparse=sparse)
-        model.adopt_moments(state["moments"], torch.arange(len(field)))
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a result of `state` whose parameters this field was created from."""
+        self.adopt_moments(state["moments"], torch.arange(len(self)))
         for name, gradient in state.get("gradients", {}).items():  # of views since the last step
-            model.params[name].grad = gradient.to(device)
-        return model
+            self.params[name].grad = gradient.to(self.params[name].device)
 
 
 def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[str, float]:
@@ -257,13 +245,10 @@ def _moments_of(sh_in_one: bool, moments: dict[str, dict[str, Tensor]]) -> dict[
         return {**others, "sh": both}
     if not sh_in_one and "sh" in moments:
         parts = {"sh0": slice(0, 1), "shN": slice(1, None)}
-        return {
-            **others,
-            **{
-                name: {key: value if key == "step" else value[:, part] for key, value in moments["sh"].items()}
-                for name, part in parts.items()
-            },
-        }
+        both = moments["sh"]
+        for name, part in parts.items():
+            others[name] = {key: value if key == "step" else value[:, part] for key, value in both.items()}
+        return others
     return moments
 
 

@@ -14,11 +14,12 @@ import torch
 from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.densification import Densifier, ViewScores
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Multiview
@@ -29,19 +30,6 @@ HIGHEST_OPACITY = 0.8
 """Opacities are lowered to this at each refinement: nothing behind an opaque Gaussian gets a gradient."""
 LATE_OPACITY, LATE_BLAME = 0.1, 0.9
 """After densification, Gaussians with a lower opacity or a larger blame are removed."""
-
-
-@dataclass(frozen=True)
-class ViewScores:
-    """Hold each Gaussian's part in the errors of some views.
-
-    Attributes:
-        pixels: (n,) pixels with large errors that it makes up: its weights alpha T there summed, mean over views.
-        blame: (n,) the same with each view weighted by its loss, scaled to the range from 0 to 1.
-    """
-
-    pixels: Tensor
-    blame: Tensor
 
 
 @dataclass(frozen=True)
@@ -124,7 +112,11 @@ class MultiviewDensifier(Densifier):
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of absolute gradients, too; see `DensityControl`."""
         super().accumulate(result, camera)
-        assert result.absgrad2d is not None, "a rasterizer without absolute gradients"
+        if result.absgrad2d is None:
+            raise UserInputError(
+                "--strategy multiview needs the RenderResult's absgrad2d, which this rasterizer leaves empty; choose "
+                "--strategy mcmc, which needs none, or another --rasterizer"
+            )
         if self.state["absgrad2d"] is None:
             self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
         size = camera.width, camera.height

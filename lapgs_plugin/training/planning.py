@@ -6,7 +6,7 @@ import torch
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
-from lapgs_plugin.training.quality import require_views_to_set_aside
+from lapgs_plugin.training.quality import LEAST_VIEWS
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import BEST, TrainSettings
 
@@ -27,8 +27,11 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         raise UserInputError(
             f"--views-per-step {asked}: the scene has {views} training views; give at most as many, or auto"
         )
-    if views is not None and settings.keep == BEST:
-        require_views_to_set_aside(views)
+    if views is not None and settings.keep == BEST and views < LEAST_VIEWS:
+        raise UserInputError(
+            f"--keep best: sets training views aside, and the scene has {views} of them, expected at least "
+            f"{LEAST_VIEWS}; leave it out"
+        )
     return StagePlan.create(size, settings.scheduled, settings.levels, settings.shares, settings.kind)
 
 
@@ -41,8 +44,8 @@ def unpruned_levels(plan: StagePlan, settings: TrainSettings) -> list[int]:
     """Return the levels, coarsest first, that --prune leaves as they are, because their densification does not end."""
     if not settings.prune:
         return []
-    schedules = {s.level: StageSchedule.create(settings, s, iterations_continued(plan, s)) for s in plan}
-    return [level for level, schedule in schedules.items() if schedule.prunes_after is None]
+    schedules = [(stage, StageSchedule.create(settings, stage, iterations_continued(plan, stage))) for stage in plan]
+    return [stage.level for stage, schedule in schedules if schedule.prunes_after is None]
 
 
 def require_pruning(plan: StagePlan, settings: TrainSettings) -> None:

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.training.settings import enough_iterations
 
 SAMPLES_OF_A_STAGE = 5
@@ -43,15 +42,6 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
 def set_aside(views: Sequence[View]) -> list[View]:
     """Return the training views that choose the best state: one of 16, but two at least and eight at most."""
     return spread_views(views, min(SAMPLED_VIEWS, max(2, len(views) // 16)))
-
-
-def require_views_to_set_aside(count: int) -> None:
-    """Raise a UserInputError if there are too few training views to set some aside."""
-    if count < LEAST_VIEWS:
-        raise UserInputError(
-            f"--keep best: sets training views aside, and the scene has {count} of them, expected at least "
-            f"{LEAST_VIEWS}; leave it out"
-        )
 
 
 def copied(state: Any) -> Any:

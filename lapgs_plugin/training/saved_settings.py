@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
+from typing_extensions import NotRequired
+
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
 from lapgs_plugin.training.settings import IN_MANIFEST, LAST, OFF, TrainSettings
@@ -54,10 +56,15 @@ def settings_from_manifest(manifest: Manifest, name: str = "the run's manifest")
         raise RunFolderError(f"{name} is damaged: {error}; {advice}") from error
 
 
+class _OldDensification(StrictWithMore):
+    strategy: NotRequired[str]
+
+
 class _OldSettings(StrictWithMore):
     """Settings of a run of any version that `_of_this_version` converts."""
 
-    densification: dict[str, Any]
+    densification: _OldDensification
+    inherit_ratio: NotRequired[float]
     learning_rates: dict[str, Any]
     split: str | list[str] | None
 

@@ -170,22 +170,15 @@ class StageSchedule:
     def sampled(self, count: int) -> frozenset[int]:
         """Return so many iterations, evenly spread and ending with the last, after which quality is measured.
 
-        Of a stage that is extended they are iterations of the extension.
-
-        Those that follow a reset of opacities closely come before it instead: no field looks like itself then.
+        Of a stage that is extended they are iterations of the extension, which resets no opacities. Others that follow
+        a reset closely come before it instead: no field looks like itself then.
         """
-        found = set()
+        found, before = set(), self.iterations if self.extended else 0
         for index in range(1, count + 1):
-            due = math.ceil((self.extended or self.iterations) * index / count)
-            due += self.iterations if self.extended else 0
+            due = before + math.ceil((self.end - before) * index / count)
             reset, since = divmod(due, self.reset_every)
-            if (
-                reset
-                and not self.extended
-                and due < self.densify_until + RECOVERY
-                and since < RECOVERY
-                and index < count
-            ):
+            recovers = reset and since < RECOVERY and due < self.densify_until + RECOVERY and not self.extended
+            if recovers and index < count:
                 due -= since + self.views  # the step that ends with the reset is the one after it
             found.add(max(1, due))
         return frozenset(found)

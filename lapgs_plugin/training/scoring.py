@@ -14,8 +14,9 @@ from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.pruning import blended_pixels, least_blended
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.training.densification import ViewScores
 from lapgs_plugin.training.losses import ViewLosses
-from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, ViewScores, view_scores
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, view_scores
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.views import LevelView, shuffled
 
@@ -61,7 +62,7 @@ class FieldScoring:
                 below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
                 self.breakdown.mark("densification")
                 composed = self.losses.exposed([view.name], image if below is None else image + below)
-                whole = fill_outside(composed, target, images.get_weights([view.name]))
+                whole = fill_outside(composed, target, images.get_weights(view.name))
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view, 0), whole, target, loss)
 

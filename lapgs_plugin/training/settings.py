@@ -10,7 +10,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.options import check_values, option, option_name, options_of
+from lapgs_plugin.options import check_values, option, option_name, options_of, require_positive
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
@@ -24,7 +24,6 @@ from lapgs_plugin.training.strategies import (
     Mcmc,
     StagePart,
     Strategy,
-    require_positive,
 )
 from lapgs_plugin.untrusted import STRICT
 
@@ -96,6 +95,13 @@ class Densification:
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
+    strategy: str = option(
+        AUTO,
+        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
+        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
+        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
+        panel=PANEL,
+    )
     start: int | None = option(
         None,
         "Iteration of each stage after which densification begins. Default: "
@@ -125,13 +131,6 @@ class Densification:
         "the coarsest level alone. No option of --strategy mcmc.",
         panel=PANEL,
         names=("--opacity-reset-every",),
-    )
-    strategy: str = option(
-        AUTO,
-        "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
-        "does), multiview (the same, only where several views have large errors), or one of an installed package. "
-        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
-        panel=PANEL,
     )
     options: Strategy = options_of(STRATEGIES, "strategy")
 
@@ -232,7 +231,6 @@ class TrainSettings(HierarchySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_values(self)
         self._choose_strategy()
         self.learning_rates.check()
         self.densification.check()
@@ -372,6 +370,18 @@ class TrainSettings(HierarchySettings):
             return self.sh_rate_factor
         return min(MOST_SH_RATE, max(1.0, training_views / SH_RATE_VIEWS))
 
+    @property
+    def joint_share(self) -> float:
+        """See `HierarchySettings.joint_share`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_joint
+        return super().joint_share if own is None or self.nested or self.joint is not None else own
+
+    @property
+    def color_factor(self) -> float:
+        """See `HierarchySettings.color_factor`; a strategy may have a default of its own."""
+        own = self.densification.options.residual_color_rate
+        return super().color_factor if own is None or self.residual_color_rate is not None else own
+
     def dropout_for(self, training_photos: int) -> float:
         """Return the share of Gaussians that the last steps of a stage leave out."""
         if self.dropout is not None:
@@ -416,8 +426,8 @@ class TrainingControl(MeasuringOptions):
 
     rasterizer: str = option(
         AUTO,
-        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
-        "else cpu.",
+        "gsplat (CUDA), cpu, oracle (slow, plain PyTorch, for checking), or one of an installed package. auto: gsplat "
+        "where there is a CUDA device, else cpu.",
         panel=RUN,
     )
     threads: int | None = option(

@@ -79,6 +79,7 @@ class StageRun:
         coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
+        batches: whether views of one size are rendered together.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
@@ -98,13 +99,14 @@ class StageRun:
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
-    coarser: CoarserLevels = field(default_factory=CoarserLevels)
-    exposures: ViewExposures | None = None
-    poses: ViewPoses | None = None
-    breakdown: Breakdown = field(default_factory=Breakdown)
-    busy: GpuBusy = field(default_factory=GpuBusy)
-    progress: StageProgress = field(default_factory=StageProgress)
-    say: Callable[[str], None] = print
+    coarser: CoarserLevels
+    exposures: ViewExposures | None
+    poses: ViewPoses | None
+    batches: bool
+    breakdown: Breakdown
+    busy: GpuBusy
+    progress: StageProgress
+    say: Callable[[str], None]
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
@@ -193,18 +195,13 @@ class StageRun:
         """Number of losses that are read together."""
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
-    @property
-    def _batches(self) -> bool:
-        """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
-        return self.poses is None and self.rasterizer.can_batch
-
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))
 
     def _launches(self, iterations: range) -> list[list[int]]:
         """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
-        if not self._batches or len(iterations) == 1:
+        if not self.batches or len(iterations) == 1:
             return [[iteration] for iteration in iterations]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for iteration in iterations:
@@ -289,7 +286,7 @@ class StageRun:
         self.coarser.start_if_joint(last)
         views = [self._view(iteration) for iteration in iterations]
         names = [view.name for view in views]
-        losses_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_losses(iterations, names)
+        loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names)
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
@@ -297,9 +294,8 @@ class StageRun:
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, [view.camera for view in views], last)
         self.breakdown.mark("loss")
-        losses = losses_of(rendered)
+        loss = loss_of(rendered)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
-        loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         kept = loss.detach()
         if result is not None:
             result = replace(result, image=kept, transmittance=None)
@@ -313,8 +309,8 @@ class StageRun:
         self.breakdown.mark("other")
         return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
 
-    def _hooked_losses(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], list[Tensor]]:
-        """Call the hooks that come before a render; return what computes the losses of some views from it."""
+    def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], Tensor]:
+        """Call the hooks that come before a render; return what computes the loss of some views from it."""
         contexts = self._losses.contexts(iterations, names)
         for context in contexts:
             self.hooks.before_render(context)

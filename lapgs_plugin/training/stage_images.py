@@ -49,12 +49,9 @@ class StageImages:
             return
         try:
             with overhead.timed("cache"):
-                self.train_predictions = self._predictions(
-                    stage, refined_views(context.archive, context.scene.train), TRAIN
-                )
-            measured = [*context.scene.test, *context.aside]
+                self.train_predictions = self._predictions(stage, context.scene.train, TRAIN)
             with overhead.timed("evaluation"):
-                self.test_predictions = self._predictions(stage, refined_views(context.archive, measured), TEST)
+                self.test_predictions = self._predictions(stage, [*context.scene.test, *context.aside], TEST)
         except BaseException:
             self.close()
             raise
@@ -83,7 +80,7 @@ class StageImages:
         return self._context.archive.path(CACHE)
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
-        """Return Up(I_hat^(l+1)) of each view, for the stage of level l."""
+        """Return Up(I_hat^(l+1)) of each view at its refined pose, for the stage of level l."""
         context, coarser = self._context, stage.level + 1
         where = context.settings.images_on
         if where == AUTO and name == TEST:
@@ -92,7 +89,7 @@ class StageImages:
         cache = self._stores(views, where).make_upsampled(coarser, precision, name, context.pyramid)
         if views:
             renderer = HierarchyRenderer.from_archive(context.archive, context.rasterizer, context.device)
-            for view in views:
+            for view in refined_views(context.archive, views):
                 camera = level_camera(view.camera, stage.level)
                 cache.put(view.name, renderer.images([view.camera], coarser)[0], (camera.height, camera.width))
         return cache

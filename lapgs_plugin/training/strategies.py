@@ -6,13 +6,13 @@ Each strategy here says what differs between strategies in the rest of training;
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.options import check_values, option, option_name
+from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.options import check_values, option, option_name, require_positive
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
 
@@ -66,12 +66,16 @@ class Strategy:
         densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
         few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
+        residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
+        residual_color_rate: default of `TrainSettings.residual_color_rate`; None for the hierarchy's.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
     densify_until: ClassVar[int] = 15_000
     unused: ClassVar[tuple[str, ...]] = ()
     few_dropout: ClassVar[float] = 0.0
+    residual_joint: ClassVar[float | None] = None
+    residual_color_rate: ClassVar[float | None] = None
 
     @property
     def needs_absgrad(self) -> bool:
@@ -101,8 +105,11 @@ class Strategy:
         Args:
             schedule: of the stage.
             extent: of the scene, in world units.
+
+        Raises:
+            UserInputError: a subclass does not override it.
         """
-        raise NotImplementedError
+        raise UserInputError(f"strategy {type(self).__qualname__} has no method density_control; it has to make one")
 
 
 @dataclass(frozen=True)
@@ -221,6 +228,8 @@ class Mcmc(Regularized):
     densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
     few_dropout: ClassVar[float] = 0.2
+    residual_joint: ClassVar[float | None] = 0.5
+    residual_color_rate: ClassVar[float | None] = 1.0
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )
@@ -294,13 +303,7 @@ class Auto(Mcmc, Gradients):
         return kind(**{each.name: getattr(self, each.name) for each in fields(kind)})
 
 
-def require_positive(name: str, value: float, kind: str) -> None:
-    """Raise a UserInputError about a number that is not positive and finite."""
-    if not (value > 0.0 and math.isfinite(value)):
-        raise UserInputError(f"{name} {value}: expected a positive {kind}")
-
-
-AUTO, MCMC, GRADIENTS = "auto", "mcmc", "3dgs"
+MCMC, GRADIENTS = "mcmc", "3dgs"
 STRATEGIES: Registry[Strategy] = Registry(
     "--strategy",
     "lapgs_plugin.strategies",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -12,9 +13,9 @@ import torch
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
-from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -147,6 +148,8 @@ class Trainer:
         """Tell the user what the settings mean for this scene and device."""
         scene, say = self._context.scene, self.monitor.say
         say(self._strategy_line())
+        if (hooks := hooks_line()) is not None:
+            say(hooks)
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
         if self.settings.dropout is None and (share := self.settings.dropout_for(len(scene.train))) > 0.0:
@@ -164,8 +167,8 @@ class Trainer:
         return f"density control: --strategy {self.settings.densification.strategy}{words}"
 
     def _strategy_of(self, stage: Stage) -> Strategy:
-        views = level_views(self._context.scene.train, stage.level)
-        return self.settings.strategy_of(stage, sum(view.camera.width * view.camera.height for view in views))
+        sizes = (level_size(view.camera.size, stage.level) for view in self._context.scene.train)
+        return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""
@@ -251,7 +254,7 @@ class Trainer:
 
     @property
     def _batches(self) -> bool:
-        """Whether the rasterizer renders several views together; poses are refined with each view alone."""
+        """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
         return not self.settings.refine_poses and self.rasterizer.can_batch
 
     def _stage_run(
@@ -285,11 +288,10 @@ class Trainer:
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
             densifier=self._strategy_of(stage).density_control(schedule, context.scene.extent),
-            coarser=CoarserLevels(
-                images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown=breakdown
-            ),
+            coarser=CoarserLevels(images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown),
             exposures=first_exposures(context, stage, checkpoint, overhead),
             poses=poses,
+            batches=self._batches,
             breakdown=breakdown,
             progress=StageProgress() if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
@@ -316,6 +318,8 @@ class Trainer:
         for name, learned in run.transforms.items():
             shape = None if learned is None else learned.transforms.shape
             check_transforms(checkpoint.get(name), shape, name, path)
+            if (best := checkpoint.get("best")) is not None:
+                check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
     def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:

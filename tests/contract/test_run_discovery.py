@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+from argparse import Namespace
+from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -16,6 +18,7 @@ from lapgs_plugin.checkouts.profile import held_by
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.doctor_checkout import describe
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.installed_packages import explain_import_error
@@ -87,6 +90,28 @@ def test_a_package_that_is_not_installed_is_to_be_installed(fork: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("code", ["CUDAExtension", "Extension"])
+def test_a_package_that_the_checkout_brings_is_installed_from_there(fork: Path, code: str) -> None:
+    """As GaussianPro's propagation: nobody else has a package of that name, or a stranger has."""
+    folder = fork / "submodules" / "Propagation"
+    folder.mkdir(parents=True)
+    (folder / "setup.py").write_text(f"setup(ext_modules=[{code}('open3d._C', ['a.cu'])])")
+    error, script = ModuleNotFoundError("No module named 'open3d'", name="open3d"), fork / "scripts" / "train.py"
+    on_gpu, on_cpu = (str(explain_import_error(error, script, on_cpu=on_cpu)) for on_cpu in (False, True))
+    (packages,) = (each for each in describe(script)["Packages"] if each.name == "open3d")
+    stand_in = describe(script)["lapgs run"][-1].detail
+    if code == "CUDAExtension":
+        assert on_gpu.endswith(f": {packages.advice}")
+        assert packages.advice == f"pip install --no-build-isolation {folder}"
+        assert on_cpu.endswith("no CPU stand-in has what the checkout takes from it; it needs CUDA")
+        assert stand_in.startswith("no CPU stand-in for open3d, which scripts/train.py:3 imports from ")
+    else:
+        assert on_gpu == on_cpu
+        assert on_cpu.endswith(f": {packages.advice}")
+        assert packages.advice == f"pip install {folder}"
+        assert "open3d" not in stand_in
+
+
 WINDOW = StageWindow(Stage(0, (8, 6), 20, signed=True), 10, 30, 2, 4.0, 2.0)
 
 
@@ -109,6 +134,25 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     with pytest.raises(UserInputError, match=r"training\(cfg, options, .* got no argument with source_path") as caught:
         TrainingCall.bind(training, (1, options, []), {})
     assert "\n" not in str(caught.value)
+
+
+def test_options_in_a_global_variable_name_the_output_folder_of_the_call() -> None:
+    """As DropGaussian's, whose dry run would otherwise write into the run's folder."""
+    names: dict[str, Any] = {"args": Namespace(model_path="out", quiet=True), "other": Namespace(quiet=True)}
+    exec(
+        "written = []\ndef training(dataset, opt, own):\n"
+        "    written.extend([args.model_path, own.model_path])\n    if opt.stop: raise KeyboardInterrupt",
+        names,
+    )
+    dataset = SimpleNamespace(source_path="scene", model_path="out/level_1")
+    for own in (names["args"], Namespace(model_path="out")):
+        opt = SimpleNamespace(iterations=30, stop=own is not names["args"])
+        call = TrainingCall.bind(names["training"], (dataset, opt, own), {})
+        with pytest.raises(KeyboardInterrupt) if opt.stop else nullcontext():
+            call.run()
+        assert (names["args"].model_path, own.model_path) == ("out", "out"), "put back"
+    assert names["written"] == ["out/level_1"] * 4
+    assert vars(names["other"]) == {"quiet": True}
 
 
 def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:

@@ -62,6 +62,12 @@ FAILURES = {
         "        assert iteration == 1, 'the dry run trains on'\n",
         r"train.py:\d+: training\(\) began no iteration, expected one call of update_learning_rate",
     ),
+    "residuals whose colours the renderer clamps": (
+        "gaussian_renderer/__init__.py",
+        "    elif pipe.convert_SHs_python:\n",
+        "    elif pc is not None:\n",
+        r"train.py:\d+: colours of both signs do not come out of the checkout's renderer, .* --hierarchy nested",
+    ),
     "residuals at another size": (
         "gaussian_renderer/__init__.py",
         "image_height=int(viewpoint_camera.image_height)",
@@ -129,6 +135,33 @@ def test_what_is_rendered_has_to_be_what_is_archived(
     warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
     assert [bool(re.match(message, each)) for each in warnings] == ([] if signed else [True])
     assert (tmp_path / "run").exists() != signed
+
+
+def test_what_a_renderer_does_in_training_alone_is_left_out_of_predictions_and_measurements(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As DropGaussian's, which leaves Gaussians out at random, more of them with each iteration."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    edits = {
+        "gaussian_renderer/__init__.py": [
+            ("    use_trained_exp=False,\n", "    use_trained_exp=False,\n    is_train=False,\n    iteration=None,\n"),
+            ("opacities=pc.get_opacity,", "opacities=pc.get_opacity * (0.9 ** (iteration / 2) if is_train else 1),"),
+        ],
+        "train.py": [
+            ("            bg,\n", "            bg,\n            is_train=True,\n            iteration=iteration,\n")
+        ],
+    }
+    for file, changes in edits.items():
+        text = (checkouts / "graphdeco" / file).read_text(encoding="utf-8")
+        for old, new in changes:
+            assert text.count(old) == 1
+            text = text.replace(old, new)
+        (checkouts / "graphdeco" / file).write_text(text, encoding="utf-8")
+    script, results = checkouts / "graphdeco" / "train.py", list[Result]()
+    with captured(tmp_path, results), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as one:
+        drive(one, levels=1, dry_run=True)
+    assert RunArchive.open(tmp_path / "run").manifest.complete
+    assert not [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
 
 
 @pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])

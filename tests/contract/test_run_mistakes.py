@@ -253,8 +253,8 @@ def test_a_field_that_diverges_is_one_line(scene: Path, tmp_path: Path, caplog: 
 
 def test_options_of_the_hierarchy_are_checked_before_anything_is_read() -> None:
     for options, message in (
-        ({"prediction_precision": "int4"}, "--prediction-precision int4: expected auto, float32, float16, uint8"),
-        ({"images_on": "tape"}, "--images-on tape: expected auto, gpu, memory, disk"),
+        ({"prediction_precision": "int4"}, "--prediction-precision int4: expected auto, float32, float16 or uint8"),
+        ({"images_on": "tape"}, "--images-on tape: expected auto, gpu, memory or disk"),
         ({"residual_color_rate": 0.0}, "--residual-color-rate 0.0: expected a positive factor"),
         ({"prune": 1.0}, "--prune 1.0: expected a share from 0"),
         ({"split": "half"}, "--split 'half'"),

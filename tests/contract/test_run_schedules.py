@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
@@ -54,6 +57,46 @@ def published_call(name: str, adapter: Any, **changes: Any) -> TrainingCall:
         defaults = {"budget": 20.0, "mode": "multiplier", "ho_iteration": 15_000, "benchmark_dir": None}
         values |= {"score_coefficients": {}, "args": Namespace(**defaults)}
     return TrainingCall.bind(adapter.train.training, (), {**values, **changes})
+
+
+def test_local_variables_that_hold_options_and_numbers_are_read() -> None:
+    """As in GaussianPro: one bound is compared as the option, the other as a copy of it."""
+
+    class Options:
+        begin, end, every = 9_000, 12_000, 20
+
+    (tree,) = ast.parse(
+        """
+def training(opt):
+    end, late = 1, 2
+    stop = opt.end
+    prune_at = 24_000
+    last = 0
+    for iteration in range(1, 30_001):
+        if iteration > opt.begin and iteration < stop and iteration % opt.every == 0:
+            gaussians.densify()
+        if iteration == prune_at:
+            gaussians.prune()
+        if iteration > last:
+            last = iteration
+"""
+    ).body
+    assert isinstance(tree, ast.FunctionDef)
+    schedule, variables = Schedule(tree), {"opt": Options()}
+    lines = schedule.describe(variables)
+    assert "iteration > 9000 and iteration < 12000 and" in lines[0]
+    assert lines[1].endswith("iteration == 24000 (prune)")
+    changed = schedule.for_stage(variables, variables, FINEST)
+    assert changed.options == {("opt", "begin"): 6_000, ("opt", "end"): 8_000}
+    assert "24000 -> 16000" in changed.notes
+    pruned: list[int] = []
+    counting = SimpleNamespace(
+        densify=lambda: None, prune=lambda: pruned.append(sys._getframe(1).f_locals["iteration"])
+    )
+    names: dict[str, Any] = {"gaussians": counting}
+    exec(ast.unparse(tree), names)
+    changed.function(names["training"])(Options())
+    assert pruned == [16_000]
 
 
 @pytest.mark.parametrize("name", NAMES)

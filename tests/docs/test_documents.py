@@ -19,12 +19,14 @@ from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, pros
 WITH_COMMANDS = [path for path in PAGES if commands(path)]
 OF_OTHERS = {
     # of scripts of the backbones
-    "--benchmark_dir", "--cams", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
+    "--benchmark_dir", "--cams", "--cap_max", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
-    "--highfeature_lr", "--ho_iteration", "--kernel_size", "--max_n_gaussian", "--mult", "--opacity_reset_interval",
-    "--optimizer_type",
+    "--highfeature_lr", "--ho_iteration", "--kernel_size", "--loss_thresh", "--max_n_gaussian", "--mult",
+    "--opacity_reset_interval", "--optimizer_type",
     "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
     "--test_iterations",
+    # of the authors' release
+    "--iter_plan",
     # of the extension in docs/extending.md
     "--duplicates",
     # of gsplat's trainer, pip and mkdocs

@@ -469,7 +469,7 @@ def test_two_writers_in_one_process_are_refused(tmp_path: Path) -> None:
 def test_writing_needs_the_lock(tmp_path: Path) -> None:
     complete_run(tmp_path)
     archive = RunArchive.open(tmp_path)
-    with pytest.raises(AssertionError, match="resume=True"):
+    with pytest.raises(RunFolderError, match="resume=True"):
         archive.append_history({"level": 0, "iteration": 1})
     archive.write_metrics({"psnr": 1.0})  # `lapgs eval` needs none
 

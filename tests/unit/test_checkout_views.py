@@ -134,7 +134,52 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
         else:
             image.sum().backward()
     assert render(view).unique().tolist() == [1.375], "the model's own colours are composed"
-    assert wrapper.given == ()
+    assert wrapper.running.given == ()
+
+
+@pytest.mark.parametrize(("model", "first"), [("sh", "image"), ("sh", "depths"), ("colors", "image")])
+def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_they_are(
+    model: str, first: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As GaussianPro's opacities: the colours are made inside of the renderer."""
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    assert wrapper.rendering is not None
+    wrapper.rendering.capture = True
+    view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
+
+    def forward(means: Tensor, shs: Tensor | None, colors_precomp: Tensor | None, rasterizer_settings: Settings) -> Any:
+        size = rasterizer_settings.image_height, rasterizer_settings.image_width, 3
+        values = shs.mean((0, 1)) if colors_precomp is None else colors_precomp.mean(0)  # type: ignore[union-attr]
+        return torch.zeros(1), means.mean() + values.expand(size)
+
+    function = wrapper._function(forward)
+
+    @wrapper.renderer
+    def render(viewpoint: Any) -> dict[str, Tensor]:
+        made, means = settings(3, 4, torch.zeros(3), torch.eye(4)), torch.zeros(2, 3, requires_grad=True)
+        given = {"sh": (torch.full((2, 1, 3), 0.125), None), "colors": (None, torch.full((2, 3), 0.125))}[model]
+        calls = {"image": given, "depths": (None, torch.full((2, 3), 0.5))}
+        order = ("image", "depths") if first == "image" else ("depths", "image")
+        return {name: function(means, *calls[name], made)[1] for name in order}
+
+    if first == "depths":
+        render(view)  # it is known from then on that this renderer passes on SH
+    found = render(view)
+    assert wrapper.rendering.captured is not None
+    assert found["image"].unique().tolist() == wrapper.rendering.captured.unique().tolist() == [0.375]
+    assert found["depths"].unique().tolist() == [0.5]
+    found["image"].sum().backward()
+    with pytest.raises(UserInputError, match="other colours than the model's"):
+        found["depths"].sum().backward()
+    assert not caplog.records
+    wrapper.rendering.capture, wrapper.rendering.images = (
+        False,
+        SimpleNamespace(targets=None, weights=None, coarse=None),
+    )  # type: ignore[assignment]
+    render(view), render(view)
+    (warning,) = (each.getMessage() for each in caplog.records)
+    assert "in a residual they are those of its own Gaussians, not the scene's" in warning
 
 
 @pytest.mark.parametrize("how", ["the camera", "a copy of its matrix", "a transposed matrix"])
@@ -156,7 +201,7 @@ def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
             image = render(None, camera.world_view_transform.T.contiguous())
     assert image.shape == (3, 4, 3)
     assert image.unique().tolist() == [0.75], "over zero, not over the checkout's white background"
-    assert wrapper.noted is None
+    assert wrapper.running.key is None
 
 
 def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo() -> None:

@@ -100,6 +100,8 @@ def cut(saved: Saved, *keys: Any) -> Saved:
 
 
 STATE = ("state",)
+COLOURS: Saved = {"transforms": torch.zeros(2, 3, 4), "gradient": None, "moments": {}}
+BEST: Saved = {"psnr": 20.0, "iteration": 1, "joint": None, "exposure": COLOURS}
 DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     "a list": (lambda saved: [], "holds a list, expected a dictionary"),
     "empty": (lambda saved: {}, "holds level None and a state that is a NoneType"),
@@ -157,6 +159,10 @@ DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     "a gradient": (
         lambda saved: put(saved, {"means": torch.zeros(2, 3)}, "state", "model", "gradients"),
         r"model\.gradients\.means is float32 \(2, 3\)",
+    ),
+    "colours of the best state": (
+        lambda saved: put(saved, {**BEST, "model": saved["state"]["model"]}, "state", "best"),
+        "best.exposure is not the state of transforms for 0 views",
     ),
     "densifier": (lambda saved: put(saved, {}, "state", "densifier"), "densifier is not the state"),
     "densifier cut": (

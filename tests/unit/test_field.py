@@ -287,6 +287,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, mon
     ("name", "shape", "message"),
     [
         ("means", (5, 2), r"means has shape \(5, 2\)"),
+        ("means", (), r"means has shape \(\), expected \(0, 3\)"),
         ("quaternions", (4, 4), r"quaternions has shape \(4, 4\), expected \(5, 4\)"),
         ("opacity_logits", (5, 1), r"opacity_logits has shape \(5, 1\)"),
         ("sh", (5, 5, 3), r"sh has shape \(5, 5, 3\)"),

@@ -216,7 +216,7 @@ def test_damaged_corrections_are_refused(tmp_path: Path) -> None:
 def test_a_checkpoint_of_other_views_is_refused(tmp_path: Path) -> None:
     shape, path = torch.Size([8, 6]), tmp_path / "checkpoint.pt"
     state = TransformsState(transforms=torch.zeros(7, 6), gradient=None, moments={})
-    for found in (state, None):
+    for found in (state, {**state, "transforms": torch.zeros(())}, None):
         with pytest.raises(RunFolderError, match="poses is not the state of transforms for 8 views"):
             check_transforms(found, shape, "poses", path)
     check_transforms({**state, "transforms": torch.zeros(8, 6)}, shape, "poses", path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lapgs_plugin as lapgs
-from lapgs_plugin.errors import FieldError
+from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
+from lapgs_plugin.reference_raster import CpuRasterizer
 from tests.training_scene import blob_field, ring_camera
 
 
@@ -82,3 +84,89 @@ def test_a_loops_own_run_folder_opens(tmp_path: Path) -> None:
     assert manifest.next_level == 0
     (record,) = manifest.records
     assert (record.image_size, record.iterations, record.num_gaussians, record.train_seconds) == ((32, 24), 5, 9, 2.0)
+    assert manifest.settings == {"hierarchy": "laplacian"}
+
+
+def test_a_hierarchy_may_be_named() -> None:
+    plan = lapgs.StagePlan.create((64, 48), 10, hierarchy="laplacian")
+    assert [stage.signed for stage in plan] == [False, True]
+    assert not any(stage.signed for stage in lapgs.StagePlan.create((64, 48), 10, hierarchy="nested"))
+
+
+SCENE = lapgs.SceneReference("scene", "full", True, (0.0, 0.0, 0.0), "colmap")
+IMAGE = torch.full((3, 20, 30), 0.5)
+LEVELS = (255 * IMAGE).to(torch.uint8)
+POINTS = torch.zeros(2, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: lapgs.StagePlan.create((64, 48), 10, hierarchy="nestd"), "nestd: expected nested or laplacian"),
+        (lambda: lapgs.StagePlan.create((3, 48, 64), 10), r"\(3, 48, 64\): expected \(width, height\)"),
+        (lambda: lapgs.StagePlan.create((0, 48), 10, 1), r"\(0, 48\): expected \(width, height\)"),
+        (lambda: lapgs.level_size((64, 48), -1), "level -1: expected 0"),
+        (lambda: lapgs.level_intrinsics(torch.eye(4), (64, 48), 1), r"\(4, 4\): expected \(\.\.\., 3, 3\)"),
+        (lambda: lapgs.Pyramid().down(LEVELS), "uint8: expected floats; divide"),
+        (lambda: lapgs.ImageStore("memory", "float32").put("a", LEVELS), "view a is of torch.uint8: expected floats"),
+        (lambda: lapgs.ImageStore("disk", "float32"), "expected the folder"),
+        (lambda: lapgs.photometric_loss(*[IMAGE.permute(1, 2, 0)] * 2), r"\(20, 30, 3\): expected channels first"),
+        (lambda: lapgs.field_from_points(POINTS, 255 * torch.ones(2, 3), 1), "from 255 to 255: expected floats in"),
+        (lambda: lapgs.field_from_points(POINTS, torch.ones(2, 3).byte(), 1), "torch.uint8 from 1 to 1: expected fl"),
+        (lambda: lapgs.field_from_points(POINTS, torch.ones(3, 3), 1), r"\(2, 3\) and colours \(3, 3\): expected"),
+        (lambda: lapgs.field_from_points(POINTS, torch.ones(2, 3), -1), "sh_degree -1: expected 0 to 3"),
+        (lambda: lapgs.inherit(blob_field(2), sh_degree=7), "sh_degree 7: expected 0 to 3"),
+        (
+            lambda: CpuRasterizer()(blob_field(2), ring_camera(0), background=(0, 0, 0)),
+            r"background is a tuple, expected a \(3,\) Tensor",
+        ),
+        (
+            lambda: lapgs.field_from_splats({**lapgs.splats_from_field(blob_field(2)), "sh0": torch.zeros(2, 3)}),
+            r"sh0 has shape \(2, 3\), expected",
+        ),
+        (lambda: lapgs.Manifest.of_loop("scene", 2, "cpu"), "scene is a str, expected a SceneReference"),
+        (lambda: lapgs.Manifest.of_loop(SCENE, 2, "cpu", grid="x"), "grid x: expected camera or even"),
+        (lambda: lapgs.Manifest.of_loop(SCENE, 2, "cpu", sh_degree=4), "sh_degree 4: expected 0 to 3"),
+    ],
+)
+def test_mistakes_are_named(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(UserInputError, match=message):
+        call()
+
+
+def test_a_loop_that_forgets_what_is_finished_damages_nothing(tmp_path: Path) -> None:
+    plan, field, other = lapgs.StagePlan.create((64, 48), 10), blob_field(9), blob_field(8)
+    residual = replace(field, signed=True)
+    with lapgs.RunArchive.create(tmp_path / "run", lapgs.Manifest.of_loop(SCENE, 2, "cpu", sh_degree=0)) as archive:
+        with pytest.raises(RunFolderError, match=r"level 0 cannot be finished now, expected level 1"):
+            archive.finish_level(lapgs.LevelRecord.of(plan[0], residual), residual)
+        assert not archive.path("level_0").exists()
+        archive.finish_level(lapgs.LevelRecord.of(plan[1], field), field)
+        with pytest.raises(RunFolderError, match=r"level 1 cannot be finished now, expected level 0"):
+            archive.finish_level(lapgs.LevelRecord.of(plan[1], other), other)
+        with pytest.raises(FieldError, match=r"level 0 is an ordinary field .* its record says a residual"):
+            archive.finish_level(lapgs.LevelRecord.of(plan[0], field), field)
+        with pytest.raises(FieldError, match=r"level 0 has 9 Gaussians, its record says 8"):
+            archive.finish_level(replace(lapgs.LevelRecord.of(plan[0], residual), num_gaussians=8), residual)
+        with pytest.raises(UserInputError, match="without iteration"):
+            archive.append_history({"level": 0, "loss": 1.0})
+        with pytest.raises(UserInputError, match="expected finite numbers"):
+            archive.append_history({"level": 0, "iteration": 1, "loss": float("nan")})
+    assert torch.equal(lapgs.RunArchive.open(tmp_path / "run").field(1).means, field.means)
+
+
+def test_a_checkpoint_that_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.Adam([weight])
+    weight.sum().backward()
+    optimizer.step()
+    state = {"splats": torch.nn.ParameterDict({"means": weight}).state_dict(), "optimizer": optimizer.state_dict()}
+    others = {"size": weight.shape, "type": weight.dtype, "names": {"a"}, "bytes": b"x", "none": None, "pair": (1, 2.0)}
+    with lapgs.RunArchive.create(tmp_path / "run", lapgs.Manifest.of_loop(SCENE, 2, "cpu")) as archive:
+        archive.save_checkpoint({**state, **others})
+        with pytest.raises(UserInputError, match=r"state\['state'\]\['config'\]\[1\] is a PosixPath, expected tensors"):
+            archive.save_checkpoint({"config": [1, Path("x")]})
+        found = archive.load_checkpoint()
+    assert found is not None
+    assert torch.equal(found["optimizer"]["state"][0]["exp_avg"], optimizer.state_dict()["state"][0]["exp_avg"])
+    assert {name: found[name] for name in others} == others

@@ -60,7 +60,7 @@ def test_a_packages_supervision_is_chosen_by_name() -> None:
     ("name", "message"),
     [
         ("broken", "tiny_loss:ABSENT cannot be loaded: AttributeError"),
-        ("wrong", "tiny_loss:Halved is a ABCMeta, expected a Supervision"),
+        ("wrong", "tiny_loss:Halved is the class Halved, expected an instance of Supervision"),
         ("missing", "--supervision missing: expected reconstructed, online_residual, gt_laplacian, broken, halved"),
     ],
 )

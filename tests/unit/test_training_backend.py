@@ -12,7 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import DeviceMemoryError, MissingExtraError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    MissingExtraError,
+    RunFolderError,
+    TrainingDivergedError,
+    UserInputError,
+)
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
@@ -114,6 +120,12 @@ def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene
     unnamed = {name: value for name, value in older.items() if name not in ("views_per_step", "sh_rate_factor")}
     found = settings_from_manifest(replace(manifest, **{**SETTINGS.for_manifest(), "settings": unnamed}))
     assert (found.hierarchy, found.views_per_step, found.sh_rate_factor) == ("laplacian", "1", 1.0)
+    for damaged, message in (
+        ({"inherit_ratio": "half"}, "inherit_ratio is 'half', expected a valid number"),
+        ({"densification": {"strategy": []}}, r"densification.strategy is \[\], expected a valid string"),
+    ):
+        with pytest.raises(RunFolderError, match=message):
+            settings_from_manifest(replace(manifest, settings={**older, **damaged}))
 
 
 # --------------------------------------------------------------------------------------- gsplat's functions on a CPU
@@ -291,15 +303,11 @@ def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
             )
 
 
-def test_a_gpus_state_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpus_state_is_continued() -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
-
-    def create(field: Any, rates: Any, extent: float, *, sparse: bool) -> TrainableField:
-        return TrainableField._in_two(field, rates, extent, sparse)
-
-    monkeypatch.setattr(TrainableField, "create", create)
-    whole = stepped(create(field, LearningRates(), 4.0, sparse=False))
-    copy = TrainableField.from_state(whole.state(), LearningRates(), 4.0)
+    whole = stepped(TrainableField._in_two(field, LearningRates(), 4.0, sparse=False))
+    copy = TrainableField._in_two(whole.field, LearningRates(), 4.0, sparse=False)
+    copy.restore(whole.state())
     for model in (whole, copy):
         stepped(model, 3)
     for name, value in whole.field.parameters.items():

@@ -230,7 +230,8 @@ def test_the_papers_protocol_is_the_papers_settings_and_nothing_else() -> None:
         **{"gather": 4, "views_per_step": "8", "sh_rate_factor": 8.0},
     }
     for name, value in others.items():
-        with pytest.raises(UserInputError, match=f"--{name.replace('_', '-')} {value} with --protocol paper"):
+        shown = "accumulate-views" if name == "gather" else name.replace("_", "-")
+        with pytest.raises(UserInputError, match=f"--{shown} {value} with --protocol paper"):
             TrainSettings(protocol="paper", **{name: value})
     with pytest.raises(UserInputError, match="--protocol papers: expected default or paper"):
         TrainSettings(protocol="papers")
@@ -267,6 +268,22 @@ def test_a_base_may_densify_longer() -> None:
     for share, until in ((None, 7500), (0.8, 12_000), (0.0, 0)):
         base, residual = schedules(densification=Densification(base_share=share))
         assert (base.densify_until, residual.densify_until) == (until, 7500)
+
+
+def test_residuals_of_mcmc_have_defaults_of_their_own_and_keep_what_is_given() -> None:
+    def chosen(**values: Any) -> tuple[float, float]:
+        settings = TrainSettings(**values)
+        assert settings.rates.residual_sh == settings.learning_rates.sh * settings.color_factor
+        return settings.joint_share, settings.color_factor
+
+    mcmc, heuristics_of_3dgs = (0.5, 1.0), (0.25, 4.0)
+    assert chosen(iterations=30_000) == mcmc
+    assert chosen(iterations=3_000) == heuristics_of_3dgs
+    assert chosen(iterations=30_000, joint=0.1, residual_color_rate=2.0) == (0.1, 2.0)
+    assert chosen(iterations=30_000, protocol="paper") == (0.0, 1.0)
+    assert TrainSettings(iterations=30_000, hierarchy="nested").joint_share == 0.0
+    manifest = TrainSettings(iterations=30_000).for_manifest()["settings"]
+    assert (manifest["joint"], manifest["residual_color_rate"]) == mcmc, "a resumed run keeps them if they change"
 
 
 def test_a_base_may_have_fewer_harmonics() -> None:

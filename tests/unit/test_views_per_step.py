@@ -477,8 +477,8 @@ def test_a_batch_of_images_is_the_single_images(where: str, precision: str, tmp_
         raised = UpsampledImages(store, Pyramid())
         for index, image in enumerate(images):
             raised.put(str(index), image, (12, 18))
-        for names in (["0", "1"], ["1", "2"], ["2"]):
+        for names in (["0", "1"], ["1", "2"]):
             for name in names:
                 store.prefetch(name)
-            assert torch.equal(store.get_batch(names), torch.stack([store.get(name) for name in names]))
-            assert torch.equal(raised.get_batch(names), torch.stack([raised.get(name) for name in names]))
+            assert torch.equal(store.get(*names), torch.stack([store.get(name) for name in names]))
+            assert torch.equal(raised.get(*names), torch.stack([raised.get(name) for name in names]))

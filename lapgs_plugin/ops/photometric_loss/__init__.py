@@ -25,7 +25,8 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     else SSIM comes from the package `fused_ssim` or from kornia.
 
     Args:
-        prediction: (3, h, w), or (b, 3, h, w) of several views; other numbers of channels take longer on a GPU.
+        prediction: (3, h, w), or (b, 3, h, w) of several views; colours in [0, 1], not clamped. Other numbers of
+            channels take longer on a GPU.
         target: of that shape, without gradient; any float type, or uint8 levels k of k / 255.
         ssim_weight: lambda, in [0, 1].
 
@@ -33,8 +34,8 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
         The loss, a scalar; the mean over several views.
 
     Raises:
-        UserInputError: the images differ in shape, the target requires a gradient, the weight leaves [0, 1], or the
-            prediction is on a CPU and neither float32 nor float64.
+        UserInputError: the images differ in shape, their channels come last, the target requires a gradient, the
+            weight leaves [0, 1], or the prediction is on a CPU and neither float32 nor float64.
     """
     check_arguments(prediction, target, ssim_weight)
     if prediction.shape[-3] == 3 and triton_works(prediction):

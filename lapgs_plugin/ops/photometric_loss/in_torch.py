@@ -46,12 +46,17 @@ def check_arguments(prediction: Tensor, target: Tensor, ssim_weight: float) -> N
     """Check the arguments of `photometric_loss`, on any device.
 
     Raises:
-        UserInputError: the images differ in shape, the target requires a gradient, or the weight leaves [0, 1].
+        UserInputError: the images differ in shape, their channels come last, the target requires a gradient, or the
+            weight leaves [0, 1].
     """
     if prediction.ndim not in (3, 4) or prediction.shape != target.shape or prediction.numel() == 0:
         raise UserInputError(
             f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
             "(channels, height, width); resize the target to the level that is rendered"
+        )
+    if prediction.shape[-1] <= 4 < prediction.shape[-3]:
+        raise UserInputError(
+            f"images of shape {tuple(prediction.shape)}: expected channels first, (3, h, w); permute them"
         )
     if target.requires_grad:
         raise UserInputError("the target requires a gradient, expected a constant image; pass target.detach()")

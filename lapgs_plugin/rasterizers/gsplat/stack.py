@@ -22,14 +22,15 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import FieldStack
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
 from lapgs_plugin.rasterizers.gsplat.direct import TILE
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
-class GsplatStack:
-    """Hold activated copies of fields on a device, concatenated in one tensor per parameter; see `FieldStack`.
+class GsplatStack(FieldStack):
+    """Hold activated copies of fields on a device, concatenated in one tensor per parameter.
 
     Args:
         fields: float32, on any device. Later changes to them have no effect.
@@ -59,7 +60,6 @@ class GsplatStack:
 
     @torch.no_grad()
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
-        """Render the first fields; see `fields.rasterizer.FieldStack.render`."""
         height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
         viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
         if self._starts[len(cameras)] == 0:
