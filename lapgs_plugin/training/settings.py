@@ -424,8 +424,8 @@ class TrainingControl(MeasuringOptions):
 
     rasterizer: str = option(
         AUTO,
-        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
-        "else cpu.",
+        "gsplat (CUDA), cpu, oracle (slow, plain PyTorch, for checking), or one of an installed package. auto: gsplat "
+        "where there is a CUDA device, else cpu.",
         panel=RUN,
     )
     threads: int | None = option(

@@ -15,7 +15,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
-from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -147,6 +147,8 @@ class Trainer:
         """Tell the user what the settings mean for this scene and device."""
         scene, say = self._context.scene, self.monitor.say
         say(self._strategy_line())
+        if (hooks := hooks_line()) is not None:
+            say(hooks)
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
         if self.settings.dropout is None and (share := self.settings.dropout_for(len(scene.train))) > 0.0:
