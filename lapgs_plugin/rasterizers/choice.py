@@ -13,7 +13,7 @@ from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.environment.device import chosen_device
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, import_extension, options_of
+from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
@@ -169,7 +169,7 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
         place, module = "cpu", modules[name]
     else:
         place, module = "cuda", import_extension(name)
-    known, unsupported = _split(settings, options_of(module))
+    known, unsupported = _split(settings, constants_of(module))
     extension = CudaExtension(name, place, settings=known, module=module)
     return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
 

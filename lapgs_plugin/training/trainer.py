@@ -24,7 +24,7 @@ from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.between_steps import BetweenSteps, CheckpointTimer
+from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
@@ -111,7 +111,6 @@ class Trainer:
                     "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
                 )
         self._quality = QualityWatch()
-        self._checkpoints = CheckpointTimer(self.checkpoint_every)
 
     def run(self, resume: bool = False) -> None:
         """Train all stages that are not finished yet, or extend a finished run.
@@ -210,11 +209,11 @@ class Trainer:
             between_steps = BetweenSteps(
                 context=self._context,
                 evaluation=evaluation,
-                checkpoints=self._checkpoints,
                 watcher=self.watcher,
                 stop=stop,
                 samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
                 test_every=self.test_every,
+                checkpoint_every=self.checkpoint_every,
                 last_tick=(run.progress.seconds, run.progress.iteration),
             )
             run.hooks.on_stage_start(run.stage)
