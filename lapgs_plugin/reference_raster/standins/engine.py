@@ -243,11 +243,10 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_image: Tensor | None, grad_depth: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
         tensors = Inputs._make(ctx.saved_tensors)
         total: list[Tensor | None] = [None] * len(tensors)
-        grad_image, grad_depth = from_above[0], from_above[1]
         if grad_image is not None:
             total = _add(total, _gradients(call, tensors, call.gaussians(tensors), ctx.rendering, grad_image))
         if grad_depth is not None and call.options.inverse_depth:
