@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import importlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -31,7 +30,6 @@ from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training.strategies import STRATEGIES
-from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
 
 try:
@@ -203,7 +201,7 @@ def test_no_file_on_the_page_is_without_a_test() -> None:
         *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy", "rasterizer")),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
-    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml", "render_a_run.py"}
+    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml"}
 
 
 def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:
@@ -217,27 +215,3 @@ def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> No
     text = change.after.decode()
     assert "#include <cfloat>" in text
     assert "degree < 0 ? colour : max(colour + 0.5f, 0.0f)" in text
-
-
-def test_a_run_is_rendered_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_scene(tmp_path / "data/mine")
-    write_run(tmp_path / "runs/mine", scene)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(FILES["render_a_run.py"], "render_a_run.py", "exec"), names)
-    camera, images = names["view"].camera, names["images"]
-    assert images.composed[0].shape == (3, camera.height, camera.width)
-    up = lapgs_plugin.Pyramid().up(images.base, (camera.height, camera.width))
-    torch.testing.assert_close(images.composed[0], up + images.residuals[0], rtol=0, atol=1e-5)
-
-
-def test_the_pieces_of_a_loop_are_names_of_the_package() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    table = text[text.index("| piece | for |") : text.index("[gsplat_after.py]")]
-    named = {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)", row)}
-    assert len(named) > 8
-    assert named <= set(lapgs_plugin.__all__)
-    for piece, method in re.findall(r"`([A-Z]\w+)\.(\w+)", table):
-        assert hasattr(getattr(lapgs_plugin, piece), method)
-    for method in ("put", "prefetch", "get"):
-        assert hasattr(lapgs_plugin.ImageStore, method)
