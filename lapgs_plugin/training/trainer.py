@@ -221,7 +221,7 @@ class Trainer:
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
             evaluation.return_to_best(run)
-            self._archive_stage(run, overhead, memory.note(images.bytes_on_device))
+            self._archive_stage(run, before, overhead, memory.note(images.bytes_on_device))
             self.watcher.stage_finished(run.stage, lambda: run.fields)
 
     def _model(self, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead) -> TrainableField:
@@ -321,12 +321,12 @@ class Trainer:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
-    def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:
-        """Archive a finished stage, or the longer training of one that was finished before."""
-        stage = run.stage
-        before = self._context.record_to_extend(self._context.plan[stage.level])
+    def _archive_stage(
+        self, run: StageRun, before: LevelRecord | None, overhead: Overhead, memory: dict[str, int]
+    ) -> None:
+        """Archive a finished stage, or the longer training of one that was finished before, with its record then."""
+        stage, field = run.stage, run.model.field.detach()
         used = {} if before is None else before.memory_bytes
-        field = run.model.field.detach()
         record = LevelRecord(
             level=stage.level,
             signed=stage.signed,
