@@ -16,7 +16,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
-from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
+from lapgs_plugin.reference_raster import CPU_RASTERIZERS
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.runs.manifest import Manifest
 
@@ -112,7 +112,7 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     if name in CPU_RASTERIZERS:
         if device == "cuda":
             raise UserInputError(f"--rasterizer {name} --device cuda: it runs on the CPU; leave --device out")
-        return PlacedRasterizer(make_rasterizer(name), torch.device("cpu"), settings)
+        return PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), settings)
     if name == gsplat.NAME:
         if device == "cpu":
             raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
