@@ -236,6 +236,11 @@ class BackboneAdapter:
             if hasattr(opt, name):
                 setattr(opt, name, window.scaled(getattr(opt, name)))
         for name in self.densify_thresholds(opt):
+            if not hasattr(opt, name):
+                raise UserInputError(
+                    f"--backbone {self.info.name}: the script has no option {name}, which densify_thresholds names; "
+                    "correct the adapter, or choose another with --backbone"
+                )
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.

@@ -82,10 +82,6 @@ def _register(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tupl
         extending.lower_builtin(function, *shape)(lowering)
 
 
-def _no_value(context: Any) -> Any:
-    return context.get_dummy_value()
-
-
 # ------------------------------------------------------------------------------------- vectors and numbers mixed
 
 
@@ -335,28 +331,7 @@ def _lower_borrowed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 def _lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     _store_part(context, builder, sig, args, args[2])
-    return _no_value(context)
-
-
-def _type_change(array: Any, *numbers: Any) -> Any:
-    return types.void if _is_memory(array) else None
-
-
-def _type_at(array: Any, index: Any) -> Any:
-    if not _is_memory(array):
-        return None
-    return types.int64 if isinstance(array.dtype, types.Integer) else array.dtype
-
-
-def _lower_at(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    value = builder.load(_place(context, builder, sig, args))
-    return context.cast(builder, value, sig.args[0].dtype, sig.return_type)
-
-
-def _lower_put(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    value = context.cast(builder, args[2], sig.args[2], sig.args[0].dtype)
-    builder.store(value, _place(context, builder, sig, args))
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_broadcast(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -370,7 +345,7 @@ def _lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0i8")
     pointer = builder.bitcast(_place(context, builder, sig, args), byte)
     builder.call(function, [pointer, _INT32(0), _INT32(3), _INT32(1)])  # for reading, into all levels, data
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_splat(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -382,14 +357,12 @@ def _type_vector(array: Any, number: Any) -> Any:
 
 
 _register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed)
-_register(lanes.keep_alive, lambda array: types.void, lambda context, *_: _no_value(context))
+_register(lanes.keep_alive, lambda array: types.void, lambda context, *_: context.get_dummy_value())
 _register(lanes.load, _type_vector, _load_part)
 _register(lanes.broadcast, _type_vector, _lower_broadcast)
 _register(lanes.splat, _type_vector, _lower_splat)
 _register(lanes.store, _type_store, _lower_store)
-_register(lanes.at, _type_at, _lower_at)
-_register(lanes.put, _type_change, _lower_put)
-_register(lanes.prefetch, _type_change, _lower_prefetch)
+_register(lanes.prefetch, lambda array, index: types.void if _is_memory(array) else None, _lower_prefetch)
 
 # ------------------------------------------------------------------------------------ vectors and rows of memory
 
@@ -449,7 +422,7 @@ def _store_interleaved(context: Any, builder: Any, sig: Any, args: Any, values: 
         elements = range(WIDTH * part, WIDTH * (part + 1))
         order = [element % columns * WIDTH + element // columns for element in elements]
         _store_part(context, builder, sig, args, _pick(builder, values, order), part * WIDTH)
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_store_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -484,7 +457,7 @@ def _lower_store_rows(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     rows = _transposed(builder, _padded(args[3:]))
     for offset, row in zip(_row_offsets(context, builder, sig, args), rows, strict=True):
         _store_part(context, builder, sig, args, row, offset)
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -505,7 +478,7 @@ def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         ]
         step *= 2
     _store_part(context, builder, sig, args, vectors[0])
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 _register(lanes.load_columns, _type_load_columns, _lower_load_columns)

@@ -13,10 +13,10 @@ from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.environment.device import chosen_device
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, import_extension, options_of
+from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
-from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
+from lapgs_plugin.reference_raster import CPU_RASTERIZERS
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.runs.manifest import Manifest
 
@@ -112,7 +112,7 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     if name in CPU_RASTERIZERS:
         if device == "cuda":
             raise UserInputError(f"--rasterizer {name} --device cuda: it runs on the CPU; leave --device out")
-        return PlacedRasterizer(make_rasterizer(name), torch.device("cpu"), settings)
+        return PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), settings)
     if name == gsplat.NAME:
         if device == "cpu":
             raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
@@ -169,7 +169,7 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
         place, module = "cpu", modules[name]
     else:
         place, module = "cuda", import_extension(name)
-    known, unsupported = _split(settings, options_of(module))
+    known, unsupported = _split(settings, constants_of(module))
     extension = CudaExtension(name, place, settings=known, module=module)
     return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
 

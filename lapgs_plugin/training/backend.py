@@ -9,7 +9,7 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer, package_rasterizer, package_rasterizers
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
-from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
+from lapgs_plugin.reference_raster import CPU_RASTERIZERS
 from lapgs_plugin.training.settings import TrainSettings
 
 
@@ -58,8 +58,10 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
             own_radii=True,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
-    ours = name in CPU_RASTERIZERS or name not in package_rasterizers()
-    placed = PlacedRasterizer(make_rasterizer(name), torch.device("cpu"), {}) if ours else package_rasterizer(name)
+    if name in CPU_RASTERIZERS:
+        placed = PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), {})
+    else:
+        placed = package_rasterizer(name)
     asked = {
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,

@@ -24,10 +24,11 @@ from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.between_steps import BetweenSteps, CheckpointTimer
+from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.densification import control_of
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -100,7 +101,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             device=self.device,
             monitor=self.monitor,
-            plan=make_plan(trained.smallest_size, self.settings, len(views)),
+            plan=make_plan(self.scene.smallest_size, self.settings, len(views)),
             first_field=self.first_field,
         )
         check_storage(self.settings, self.device)
@@ -111,7 +112,6 @@ class Trainer:
                     "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
                 )
         self._quality = QualityWatch()
-        self._checkpoints = CheckpointTimer(self.checkpoint_every)
 
     def run(self, resume: bool = False) -> None:
         """Train all stages that are not finished yet, or extend a finished run.
@@ -210,11 +210,11 @@ class Trainer:
             between_steps = BetweenSteps(
                 context=self._context,
                 evaluation=evaluation,
-                checkpoints=self._checkpoints,
                 watcher=self.watcher,
                 stop=stop,
                 samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
                 test_every=self.test_every,
+                checkpoint_every=self.checkpoint_every,
                 last_tick=(run.progress.seconds, run.progress.iteration),
             )
             run.hooks.on_stage_start(run.stage)
@@ -222,7 +222,7 @@ class Trainer:
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
             evaluation.return_to_best(run)
-            self._archive_stage(run, overhead, memory.note(images.bytes_on_device))
+            self._archive_stage(run, before, overhead, memory.note(images.bytes_on_device))
             self.watcher.stage_finished(run.stage, lambda: run.fields)
 
     def _model(self, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead) -> TrainableField:
@@ -287,7 +287,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=self._strategy_of(stage).density_control(schedule, context.scene.extent),
+            densifier=control_of(self._strategy_of(stage), schedule, context.scene.extent),
             coarser=CoarserLevels(images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown),
             exposures=first_exposures(context, stage, checkpoint, overhead),
             poses=poses,
@@ -322,12 +322,12 @@ class Trainer:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
-    def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:
-        """Archive a finished stage, or the longer training of one that was finished before."""
-        stage = run.stage
-        before = self._context.record_to_extend(self._context.plan[stage.level])
+    def _archive_stage(
+        self, run: StageRun, before: LevelRecord | None, overhead: Overhead, memory: dict[str, int]
+    ) -> None:
+        """Archive a finished stage, or the longer training of one that was finished before, with its record then."""
+        stage, field = run.stage, run.model.field.detach()
         used = {} if before is None else before.memory_bytes
-        field = run.model.field.detach()
         record = LevelRecord(
             level=stage.level,
             signed=stage.signed,

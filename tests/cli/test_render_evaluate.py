@@ -24,7 +24,8 @@ from lapgs_plugin.rendering.images import caption_height
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
+from tests.cli.run_folder import SECONDS, write_run, write_scene
+from tests.folders import files_in
 
 app = typer.Typer()
 app.command("render")(render)

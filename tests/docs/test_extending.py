@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import importlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from torch import Tensor
 import lapgs_plugin
 from lapgs_plugin import ops
 from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
@@ -31,7 +31,6 @@ from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training.strategies import STRATEGIES
-from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
 
 try:
@@ -119,6 +118,11 @@ def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path
     script: Any = SimpleNamespace(module=SimpleNamespace(SPARSE_ADAM_AVAILABLE=False))
     adapter(script).level_view(view, original, (40, 30), signed=False)
     assert (view.blur, original.blur) == (2.0, 4.0)
+    options = {"dataset": SimpleNamespace(), "opt": SimpleNamespace(densify_grad_threshold=1.0)}
+    call: Any = SimpleNamespace(values=options, roles={name: name for name in options})
+    window: Any = SimpleNamespace(stage=Stage(1, (40, 30), 10, signed=False), threshold_factor=2.0)
+    with pytest.raises(UserInputError, match="--backbone my_fork: the script has no option my_threshold"):
+        adapter(script).stage_call(call, window, "folder")
 
 
 def test_the_strategy_and_the_rasterizer_train_by_name(installed: Path, tmp_path: Path) -> None:
@@ -203,7 +207,7 @@ def test_no_file_on_the_page_is_without_a_test() -> None:
         *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy", "rasterizer")),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
-    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml", "render_a_run.py"}
+    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml"}
 
 
 def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:
@@ -217,27 +221,3 @@ def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> No
     text = change.after.decode()
     assert "#include <cfloat>" in text
     assert "degree < 0 ? colour : max(colour + 0.5f, 0.0f)" in text
-
-
-def test_a_run_is_rendered_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_scene(tmp_path / "data/mine")
-    write_run(tmp_path / "runs/mine", scene)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(FILES["render_a_run.py"], "render_a_run.py", "exec"), names)
-    camera, images = names["view"].camera, names["images"]
-    assert images.composed[0].shape == (3, camera.height, camera.width)
-    up = lapgs_plugin.Pyramid().up(images.base, (camera.height, camera.width))
-    torch.testing.assert_close(images.composed[0], up + images.residuals[0], rtol=0, atol=1e-5)
-
-
-def test_the_pieces_of_a_loop_are_names_of_the_package() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    table = text[text.index("| piece | for |") : text.index("[gsplat_after.py]")]
-    named = {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)", row)}
-    assert len(named) > 8
-    assert named <= set(lapgs_plugin.__all__)
-    for piece, method in re.findall(r"`([A-Z]\w+)\.(\w+)", table):
-        assert hasattr(getattr(lapgs_plugin, piece), method)
-    for method in ("put", "prefetch", "get"):
-        assert hasattr(lapgs_plugin.ImageStore, method)
