@@ -101,7 +101,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             device=self.device,
             monitor=self.monitor,
-            plan=make_plan(trained.smallest_size, self.settings, len(views)),
+            plan=make_plan(self.scene.smallest_size, self.settings, len(views)),
             first_field=self.first_field,
         )
         check_storage(self.settings, self.device)
