@@ -19,7 +19,8 @@ from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, pros
 WITH_COMMANDS = [path for path in PAGES if commands(path)]
 OF_OTHERS = {
     # of scripts of the backbones
-    "--benchmark_dir", "--cams", "--cap_max", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from", "--depth_loss",
+    "--benchmark_dir", "--cams", "--cap_max", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
+    "--depth_loss",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
     "--highfeature_lr", "--ho_iteration", "--kernel_size", "--loss_thresh", "--max_n_gaussian", "--mult",
     "--opacity_reset_interval", "--optimizer_type",
