@@ -154,7 +154,7 @@ class DryRun:
             values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
             values["dataset"].model_path = str(folder)
             call = self._call.changed(**values)
-        return call.changed(**{name: [] for name in call.iteration_lists})
+        return call.listing(lambda _: [])
 
     def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
         """Return the checkout's scene with views of the tried stage, and make Gaussians of some of its points."""

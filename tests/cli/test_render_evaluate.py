@@ -99,7 +99,7 @@ def test_an_interrupted_run_renders_what_is_there_and_is_not_measured(scene: Pat
     run = write_run(tmp_path / "run", scene, finished=1)
     lapgs("render", run)
     assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
-    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1; finer"):
         lapgs("render", run, "--level", 0)
     with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
         lapgs("eval", run)
