@@ -414,7 +414,7 @@ def test_command_line_replaces_a_scene_by_smaller_images_of_the_same_view(
     assert sorted(entry.name for entry in out.iterdir()) == ["images", "sparse"]
     assert sorted(file.name for file in (out / "images").iterdir()) == ["00.png", "01.png", "02.png", "03.png"]
     (camera,) = pycolmap.Reconstruction(out / "sparse" / "0").cameras.values()
-    assert camera.size == (216, 144)
+    assert (camera.width, camera.height) == (216, 144)
     image = cv2.imread(str(out / "images" / "01.png")).astype(np.float32)
     smaller = cv2.resize(cv2.imread(str(few / "01.png")), (216, 144), interpolation=cv2.INTER_AREA)
     assert np.sqrt(np.mean((image - smaller) ** 2)) < 6  # of 255, seen 3.2: another filter

@@ -35,8 +35,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WIDTH, HEIGHT = 800, 440
-"""Of the window: no narrower, or the panel covers the divider; no higher, since the browser draws in software."""
+WIDTH, HEIGHT = 800, 600
 PATIENCE = 90.0
 """Seconds to wait for steps that take two; the browser renders in software on a busy machine."""
 
