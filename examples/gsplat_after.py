@@ -48,7 +48,7 @@ class Runner:
             for views in (self.scene.train, self.scene.test)
         )
         self.pyramid, self.cache = lapgs.Pyramid(), lapgs.ImageStore("memory", "float32", device=self.device)
-        scene = lapgs.SceneReference(str(args.scene.absolute()), args.resolution, True, (0, 0, 0), self.scene.kind)
+        scene = lapgs.SceneReference.of(self.scene, resolution=args.resolution)
         self.archive = lapgs.RunArchive.create(args.out, lapgs.Manifest.of_loop(scene, 2, args.rasterizer))
         self.set_splats(
             lapgs.splats_from_field(lapgs.field_from_points(self.scene.points, self.scene.colors, SH_DEGREE))

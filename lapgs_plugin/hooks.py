@@ -19,7 +19,7 @@ import difflib
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from torch import Tensor
 
@@ -243,7 +243,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
         UserInputError: one cannot be imported or created, or is not a usable hook; the line names it.
     """
     hooks = []
-    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.name, entry.value)):
+    for entry in _entries():
         source = f"entry point {entry.name} ({entry.value})"
         try:
             hook = entry.load()()
@@ -255,6 +255,16 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
         verify_hook(hook, source)
         hooks.append(hook)
     return tuple(hooks)
+
+
+def hooks_line() -> str | None:
+    """Say which hooks installed packages register: they take part in every run. None without any."""
+    found = [f"{entry.name} ({entry.value})" for entry in _entries()]
+    return f"hooks of installed packages: {', '.join(found)}" if found else None
+
+
+def _entries() -> list[EntryPoint]:
+    return sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.name, entry.value))
 
 
 HOOK_NAMES = tuple(name for name in vars(StageHook) if not name.startswith("_"))

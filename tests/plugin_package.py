@@ -8,6 +8,7 @@ import pytest
 
 from lapgs_plugin.adapters.registry import BACKBONES
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
+from lapgs_plugin.rasterizers.choice import RASTERIZERS
 
 
 def install_package(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, entry_points: str, source: str) -> None:
@@ -24,6 +25,6 @@ def install_package(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, en
     (info / "entry_points.txt").write_text(entry_points)
     (folder / f"{name}.py").write_text(source)
     monkeypatch.syspath_prepend(folder)
-    for registry in (BACKBONES, SUPERVISIONS):  # each remembers the entry points that it has found
+    for registry in (BACKBONES, SUPERVISIONS, RASTERIZERS):  # each remembers the entry points that it has found
         monkeypatch.delitem(vars(registry), "_found", raising=False)
         monkeypatch.setitem(vars(registry), "_found", type(registry)._found.func(registry))

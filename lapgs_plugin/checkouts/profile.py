@@ -32,6 +32,7 @@ OPACITY_RESET = "reset_opacity"
 """Method of the family's models that is density control and can be skipped by itself."""
 
 BACKGROUND_WORDS = {"bg", "background"}
+TRAINING_WORDS = {"train", "training"}
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,8 @@ class Profile:
     def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **given: Any) -> Any:
         """Render a view as the training loop does, and return what its function returns.
 
-        Arguments that depend on the loop's state, such as the size of a photo, have their defaults.
+        Arguments that depend on the loop's state, such as the size of a photo, have their defaults. Flags of training,
+        with which a fork leaves Gaussians out at random, are off.
 
         Args:
             values: arguments of the training function by parameter name.
@@ -163,6 +165,7 @@ class Profile:
             )
         first, second, *others = _parameters(renderer)
         named = {name: background for name in others if BACKGROUND_WORDS & set(name.split("_"))}
+        named |= {name: False for name in others if self._is_training_flag(name, values)}
         named |= {first: view, second: model} | {name: value for name, value in given.items() if name in others}
         # Looked up at each call: it may be replaced meanwhile.
         function = vars(sys.modules[renderer.__module__])[renderer.__name__]
@@ -180,6 +183,13 @@ class Profile:
             return next((self._evaluated(word.value, values) for word in words if word.arg == name), None)
         except Exception:  # it depends on the state of the loop
             return None
+
+    def _is_training_flag(self, name: str, values: Mapping[str, Any]) -> bool:
+        """Return whether a parameter of the loop's renderer says that the image is trained on."""
+        assert self.loop_renderer is not None, "asked of its parameters"
+        default = _parameters(self.loop_renderer)[name].default
+        on = default if isinstance(default, bool) else self.loop_argument(name, values)
+        return isinstance(on, bool) and bool(TRAINING_WORDS & set(name.split("_")))
 
     @property
     def _training_place(self) -> str:

@@ -6,6 +6,7 @@ Imports no torch.
 from __future__ import annotations
 
 import inspect
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -107,8 +108,21 @@ class TrainingCall:
         return replace(self, values={**self.values, **known})
 
     def run(self) -> None:
-        """Make the call."""
-        self.function(**self.values)
+        """Make the call, during which all of the script's parsed options name this call's output folder.
+
+        Some forks write into the folder of the options in a global variable.
+        """
+        variables = getattr(inspect.unwrap(self.function), "__globals__", {})
+        parsed = [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
+        kept = [(each, each.model_path) for each in parsed if hasattr(each, "model_path")]
+        folder = getattr(self.dataset, "model_path", None)
+        try:
+            for each, _ in kept:
+                each.model_path = folder
+            self.function(**self.values)
+        finally:
+            for each, before in reversed(kept):
+                each.model_path = before
 
 
 @dataclass(frozen=True)

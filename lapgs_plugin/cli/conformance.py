@@ -64,6 +64,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
+    from lapgs_plugin.rasterizers.choice import package_rasterizers
     from lapgs_plugin.rasterizers.extensions import installed_extensions
     from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
@@ -79,7 +80,18 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
         found[gsplat.NAME] = lambda: [
             Subject(gsplat.NAME, gsplat.GsplatRasterizer(), device="cuda", semantics=gsplat.SEMANTICS)
         ]
+    for name in package_rasterizers():
+        found.setdefault(name, lambda name=name: [_package_subject(name)])  # type: ignore[misc]  # as above
     return found
+
+
+def _package_subject(name: str) -> Subject:
+    """Return the rasterizer that an installed package brings."""
+    from lapgs_plugin.evaluation.conformance import Subject
+    from lapgs_plugin.rasterizers.choice import package_rasterizer
+
+    placed = package_rasterizer(name)
+    return Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)
 
 
 def _extension_subjects(name: str) -> list[Subject]:

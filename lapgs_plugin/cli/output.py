@@ -44,7 +44,7 @@ def make_table(*headings: str) -> Table:
 def show_log() -> None:
     """Print on stderr which rasterizer renders a run, and why."""
     logging.basicConfig(format="lapgs: %(message)s")
-    logging.getLogger("lapgs_plugin.rendering").setLevel(logging.INFO)
+    logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.INFO)
 
 
 def train_command(scene: Path, options: str = "") -> str:

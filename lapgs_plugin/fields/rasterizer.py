@@ -82,12 +82,20 @@ class Rasterizer(ABC):
 
     Attributes:
         name: in logs, manifests and tables.
+        devices: where the fields can be that it renders, "cuda", "cpu" or both. The first one that a machine has is
+            taken, unless --device says it.
         in_current_stream: whether all its work on a GPU goes to PyTorch's current stream, so that fields can be
             rendered concurrently.
     """
 
     name: str
+    devices: tuple[str, ...] = ("cuda", "cpu")
     in_current_stream: bool = False
+
+    @property
+    def semantics(self) -> Semantics:
+        """Where it differs from the oracle by design, for `lapgs conformance`."""
+        return Semantics()
 
     @abstractmethod
     def __call__(
@@ -97,8 +105,8 @@ class Rasterizer(ABC):
 
         Args:
             field: raw parameters; `field.signed` chooses the colour map: max(SH + 0.5, 0) or the raw SH value.
-            camera: size, intrinsics and pose.
-            background: (3,) colour behind everything; zero for residual fields.
+            camera: size, intrinsics and pose. The pose may be on another device than the field.
+            background: (3,) colour behind everything, with the field's type and device; zero for residual fields.
             sh_degree: highest SH degree to evaluate, at most `field.sh_degree`; None means all.
 
         Raises:

@@ -129,7 +129,7 @@ class Pyramid:
             UserInputError: fewer than one level.
         """
         images = self.gaussian(image, levels)
-        residuals = [fine - self.up(coarse, _size(fine)) for fine, coarse in pairwise(images)]
+        residuals = [fine - self.up(coarse, (fine.shape[-2], fine.shape[-1])) for fine, coarse in pairwise(images)]
         return [*residuals, images[-1]]
 
     def _coarse_centres(self, fine: int, coarse: int) -> tuple[float, float, int]:
@@ -180,10 +180,6 @@ def transposed_taps(first: Tensor, weights: Tensor, samples: int) -> tuple[Tenso
     back = weights.new_zeros(samples, most)
     back[summed[used], sums - earliest[summed[used]]] = weights[used]
     return earliest, back
-
-
-def _size(image: Tensor) -> tuple[int, int]:
-    return image.shape[-2], image.shape[-1]
 
 
 def _working_precision(image: Tensor) -> Tensor:

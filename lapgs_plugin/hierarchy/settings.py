@@ -86,6 +86,7 @@ class HierarchySettings:
         2,
         "Number of resolutions, each half of the next finer one; 1 trains a single field at full size, the baseline.",
         panel=PANEL,
+        least=1,
     )
     split: str | None = option(
         None,
@@ -167,8 +168,6 @@ class HierarchySettings:
         if self.protocol == "paper":
             self._follow_the_paper()
         SUPERVISIONS[self.supervision]  # raises for an unknown name
-        if self.levels < 1:
-            raise UserInputError(f"--levels {self.levels}: expected at least 1")
         if not 0 <= self.seed < 2**32:
             raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
         if self.split is not None:

@@ -33,8 +33,9 @@ def jit(function: _F) -> _F:
     The GIL is released while it runs. Division by zero gives inf or nan as in NumPy.
 
     The machine code is cached on disk beside the module, or in the user's cache folder if that folder is read-only, or
-    nowhere if neither can be written. The cache is valid until the function's file, `lanes`, or a `layout` or
-    `*_kernels` module in the same folder or the one above changes. Helpers that kernels call must live in one of these.
+    nowhere if neither can be written. The cache is valid until the function's file, `lanes`, or a `layout`, `in_torch`
+    or `*_kernels` module in the same folder or the one above changes. Helpers that kernels call and constants that they
+    read must live in one of these.
     """
     compiled: Any = njit(nogil=True, error_model="numpy")(function)
     with suppress(RuntimeError):  # Numba found no folder to write to
@@ -65,10 +66,10 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
 
 @lru_cache(maxsize=16)
 def _helpers_stamp(folder: Path) -> str:
-    """Hash the files whose functions kernels in `folder` may call."""
-    nearby = [path for place in (folder, folder.parent) for path in sorted(place.glob("*_kernels.py"))]
-    layouts = [path for place in (folder, folder.parent) if (path := place / "layout.py").exists()]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in (*_SHARED, *layouts, *nearby))).hexdigest()
+    """Hash the files whose functions and constants kernels in `folder` may use."""
+    names = "layout.py", "in_torch.py", "*_kernels.py"
+    nearby = [path for place in (folder, folder.parent) for name in names for path in sorted(place.glob(name))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in (*_SHARED, *nearby))).hexdigest()
 
 
 class _CompilationNotice(event.Listener):  # type: ignore[misc]  # see above

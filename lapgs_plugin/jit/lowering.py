@@ -82,10 +82,6 @@ def _register(function: Any, typing: _Typing, lowering: _Lowering, *shapes: tupl
         extending.lower_builtin(function, *shape)(lowering)
 
 
-def _no_value(context: Any) -> Any:
-    return context.get_dummy_value()
-
-
 # ------------------------------------------------------------------------------------- vectors and numbers mixed
 
 
@@ -335,7 +331,7 @@ def _lower_borrowed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 def _lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     _store_part(context, builder, sig, args, args[2])
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _type_change(array: Any, *numbers: Any) -> Any:
@@ -356,7 +352,7 @@ def _lower_at(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def _lower_put(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     value = context.cast(builder, args[2], sig.args[2], sig.args[0].dtype)
     builder.store(value, _place(context, builder, sig, args))
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_broadcast(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -370,7 +366,7 @@ def _lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0i8")
     pointer = builder.bitcast(_place(context, builder, sig, args), byte)
     builder.call(function, [pointer, _INT32(0), _INT32(3), _INT32(1)])  # for reading, into all levels, data
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_splat(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -382,7 +378,7 @@ def _type_vector(array: Any, number: Any) -> Any:
 
 
 _register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed)
-_register(lanes.keep_alive, lambda array: types.void, lambda context, *_: _no_value(context))
+_register(lanes.keep_alive, lambda array: types.void, lambda context, *_: context.get_dummy_value())
 _register(lanes.load, _type_vector, _load_part)
 _register(lanes.broadcast, _type_vector, _lower_broadcast)
 _register(lanes.splat, _type_vector, _lower_splat)
@@ -449,7 +445,7 @@ def _store_interleaved(context: Any, builder: Any, sig: Any, args: Any, values: 
         elements = range(WIDTH * part, WIDTH * (part + 1))
         order = [element % columns * WIDTH + element // columns for element in elements]
         _store_part(context, builder, sig, args, _pick(builder, values, order), part * WIDTH)
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_store_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -484,7 +480,7 @@ def _lower_store_rows(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     rows = _transposed(builder, _padded(args[3:]))
     for offset, row in zip(_row_offsets(context, builder, sig, args), rows, strict=True):
         _store_part(context, builder, sig, args, row, offset)
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -505,7 +501,7 @@ def _lower_store_sums(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         ]
         step *= 2
     _store_part(context, builder, sig, args, vectors[0])
-    return _no_value(context)
+    return context.get_dummy_value()
 
 
 _register(lanes.load_columns, _type_load_columns, _lower_load_columns)

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.upsample import upsample, upsample_add
@@ -60,6 +61,9 @@ def compose(
         nested: whether every render is its level's whole image.
         gains: by level, the factor on its band; 1 for levels that are not in it.
         clamped: a level whose sum is clamped to [0, 1], the last one; None for none.
+
+    Raises:
+        UserInputError: no renders, levels that do not count down by one, or a render that is not twice the coarser one.
     """
     residuals: dict[int, Tensor] = {}
     composed: dict[int, Tensor] = {}
@@ -72,12 +76,15 @@ def compose(
         if base is None or coarser is None:
             composed[level] = base = scaled(image, gain)
             continue
+        if level + 1 not in composed:
+            raise UserInputError(f"a render of level {level} after those of {list(composed)}: expected coarsest first")
         residual = image - pyramid.up(coarser, (image.shape[-2], image.shape[-1])) if nested else image
         residuals[level] = scaled(residual, gain)
         whole = nested and as_trained
         coarse, shown = composed[level + 1], level == clamped
         composed[level] = image if whole else upsample_add(pyramid, coarse, residuals[level], clamped=shown)
-    assert base is not None, "a hierarchy has at least one level"
+    if base is None:
+        raise UserInputError("no renders: expected at least that of the coarsest level")
     return Composition(base, residuals, composed)
 
 

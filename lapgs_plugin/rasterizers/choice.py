@@ -11,18 +11,25 @@ import torch
 
 from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.environment.device import chosen_device
-from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError
+from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, import_extension, options_of
+from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
-from lapgs_plugin.reference_raster import CPU_RASTERIZERS, make_rasterizer
+from lapgs_plugin.reference_raster import CPU_RASTERIZERS
+from lapgs_plugin.registry import Registry
 from lapgs_plugin.runs.manifest import Manifest
 
 logger = logging.getLogger(__name__)
 
 RASTER_SETTINGS = "raster"
 """Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
+
+OWN: dict[str, type[Rasterizer]] = {**CPU_RASTERIZERS, gsplat.NAME: gsplat.GsplatRasterizer}
+RASTERIZERS: Registry[type[Rasterizer]] = Registry(
+    "--rasterizer", "lapgs_plugin.rasterizers", Rasterizer, OWN, classes=True
+)
+"""Rasterizers by name. Other packages add subclasses of `Rasterizer`, made without arguments, as entry points."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +56,8 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
     Args:
         manifest: of the run.
         device: "cuda" or "cpu"; "auto" takes CUDA if there is a device.
-        rasterizer: "auto", "cpu", "oracle", "gsplat", or the module of an extension. On a CPU the extension's stand-in
-            renders, which has all its settings and is slow.
+        rasterizer: "auto", "cpu", "oracle", "gsplat", one of an installed package, or the module of an extension. On a
+            CPU the extension's stand-in renders, which has all its settings and is slow.
 
     Raises:
         UserInputError: an unknown device or name, or a device that this machine or the rasterizer does not have.
@@ -75,11 +82,17 @@ def _raster_settings(manifest: Manifest) -> dict[str, Any]:
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
     """Return the available rasterizer that is most similar to that of the training, and the reason."""
     same = "the one it was trained with"
+    failed = ""
+    if trained in package_rasterizers():
+        try:
+            return _named(trained, device, settings), same
+        except UserInputError as error:
+            failed = f", because {error}"
     if trained in CPU_RASTERIZERS and device != "cuda":
         return _named(trained, "cpu", settings), same
     if device == "cpu" or not torch.cuda.is_available():
         place = "on the CPU" if device == "cpu" else "without a CUDA device"
-        return _named("cpu", "cpu", settings), f"the fastest {place}"
+        return _named("cpu", "cpu", settings), f"the fastest {place}{failed}"
     obstacle = f"{trained} runs on the CPU only"
     if trained not in CPU_RASTERIZERS:
         try:
@@ -99,7 +112,7 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     if name in CPU_RASTERIZERS:
         if device == "cuda":
             raise UserInputError(f"--rasterizer {name} --device cuda: it runs on the CPU; leave --device out")
-        return PlacedRasterizer(make_rasterizer(name), torch.device("cpu"), settings)
+        return PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), settings)
     if name == gsplat.NAME:
         if device == "cpu":
             raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
@@ -108,7 +121,39 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     owners = rasterizer_owners()
     if name in owners:
         return _extension(name, owners[name].info.stand_in, device, settings)
-    raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*CPU_RASTERIZERS, gsplat.NAME, *owners])}")
+    if name in package_rasterizers():
+        placed = package_rasterizer(name, device)
+        return PlacedRasterizer(placed.rasterizer, placed.device, settings)
+    raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*RASTERIZERS, *owners])}")
+
+
+def package_rasterizers() -> tuple[str, ...]:
+    """Return the names of the rasterizers that installed packages bring."""
+    return tuple(name for name in RASTERIZERS if name not in OWN)
+
+
+def package_rasterizer(name: str, device: str = "auto") -> PlacedRasterizer:
+    """Return the rasterizer that an installed package brings under a name, and its device.
+
+    Raises:
+        UserInputError: it cannot be made, has another name, or does not render on the device; the line names it.
+    """
+    kind = RASTERIZERS[name]
+    label = f"--rasterizer {name}: {kind.__module__}.{kind.__qualname__}"
+    try:
+        made = kind()
+    except Exception as error:  # any error of a package's code must name the package
+        raise UserInputError(
+            f"{label} cannot be made without arguments: {typed_line(error)}; fix or uninstall its package"
+        ) from error
+    if made.name != name:
+        raise UserInputError(f"{label} has the name {made.name}, expected that of its entry point, {name}")
+    here = ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",)
+    usable = [each for each in made.devices if each in here and device in ("auto", each)]
+    if not usable:
+        place = "this machine has no CUDA device" if device == "auto" else f"not on --device {device}"
+        raise UserInputError(f"{label} renders on {' or '.join(made.devices)}, {place}; choose another rasterizer")
+    return PlacedRasterizer(made, torch.device(usable[0]), {})
 
 
 def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
@@ -124,7 +169,7 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
         place, module = "cpu", modules[name]
     else:
         place, module = "cuda", import_extension(name)
-    known, unsupported = _split(settings, options_of(module))
+    known, unsupported = _split(settings, constants_of(module))
     extension = CudaExtension(name, place, settings=known, module=module)
     return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
 

@@ -97,15 +97,15 @@ class CudaExtension:
         module: ModuleType | None = None,
     ) -> None:
         module = import_extension(name) if module is None else module
-        self._name = name
-        self._device = torch.device(device)
+        self.name = name
+        self.device = torch.device(device)
         self._settings = _known_settings(module)
         self._constants = {**CONSTANTS, **(settings or {})}
-        unknown = [key for key in settings or {} if key not in options_of(module)]
+        unknown = [key for key in settings or {} if key not in constants_of(module)]
         if unknown:
             raise UserInputError(
                 f"{name} as it is installed has no setting {', '.join(unknown)}; expected some of "
-                f"{', '.join(sorted(options_of(module)))}"
+                f"{', '.join(sorted(constants_of(module)))}"
             )
         arguments = inspect.signature(module.GaussianRasterizer.forward).parameters
         self._takes_dc = "dc" in arguments
@@ -115,17 +115,9 @@ class CudaExtension:
         self._module = module
 
     @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def device(self) -> torch.device:
-        return self._device
-
-    @property
     def semantics(self) -> Semantics:
         """Where it departs from the oracle by design."""
-        owner = rasterizer_owners().get(self._name)
+        owner = rasterizer_owners().get(self.name)
         return (owner.rasterizer_semantics() if owner else None) or Semantics()
 
     def render(
@@ -187,9 +179,9 @@ class CudaExtension:
 
     def _check(self, field: GaussianField, background: Tensor) -> None:
         for name, tensor in {**field.parameters, "background": background}.items():
-            if tensor.device.type != self._device.type or tensor.dtype != torch.float32:
+            if tensor.device.type != self.device.type or tensor.dtype != torch.float32:
                 raise UserInputError(
-                    f"{name} is {tensor.dtype} on {tensor.device}, expected float32 on {self._device}; use .to()"
+                    f"{name} is {tensor.dtype} on {tensor.device}, expected float32 on {self.device}; use .to()"
                 )
 
     def _sh_inputs(self, sh: Tensor) -> dict[str, Tensor]:
@@ -244,7 +236,7 @@ class _ScreenPoints(torch.autograd.Function):
         return gradient[:, :2] * ctx.pixel, None, None, None, None
 
 
-def options_of(module: ModuleType) -> frozenset[str]:
+def constants_of(module: ModuleType) -> frozenset[str]:
     """Return the names of `CONSTANTS` that the extension has."""
     return frozenset(CONSTANTS) & frozenset(module.GaussianRasterizationSettings._fields)
 

@@ -113,23 +113,28 @@ _Box = Lanes4  # first tile across and down, one past the last across and down
 
 
 @inline
+def _rows(array: Floats, first: int, n: int, columns: int, spare: Floats) -> tuple[Floats, int]:
+    """Return an array with 16 of n rows and their start: `array`, or `spare` with a copy padded with zeros."""
+    start = first * columns
+    if first + WIDTH <= n:
+        return array, start
+    for i in range(WIDTH * columns):
+        put(spare, i, at(array, start + i) if start + i < n * columns else 0.0)
+    return spare, 0
+
+
+@inline
 def _columns3(array: Floats, first: int, n: int, spare: Floats) -> Lanes3:
     """Load three columns of 16 rows from `first` on; rows past the n-th are zero."""
-    if first + WIDTH <= n:
-        return load_columns(array, first * 3, 3)
-    for i in range(3 * WIDTH):
-        put(spare, i, at(array, first * 3 + i) if first * 3 + i < 3 * n else 0.0)
-    return load_columns(spare, 0, 3)
+    rows, start = _rows(array, first, n, 3, spare)
+    return load_columns(rows, start, 3)
 
 
 @inline
 def _columns4(array: Floats, first: int, n: int, spare: Floats) -> Lanes4:
     """Load four columns of 16 rows from `first` on; rows past the n-th are zero."""
-    if first + WIDTH <= n:
-        return load_columns(array, first * 4, 4)
-    for i in range(4 * WIDTH):
-        put(spare, i, at(array, first * 4 + i) if first * 4 + i < 4 * n else 0.0)
-    return load_columns(spare, 0, 4)
+    rows, start = _rows(array, first, n, 4, spare)
+    return load_columns(rows, start, 4)
 
 
 @inline
@@ -155,12 +160,8 @@ def _length(q: Lanes4) -> Lanes:
 @inline
 def _opacity(opacities: Floats, first: int, n: int, raw: bool, spare: Floats) -> tuple[Lanes, Lanes]:
     """Return the opacities of 16 Gaussians, and the derivatives of their logarithms by the parameters."""
-    if first + WIDTH > n:
-        for i in range(WIDTH):
-            put(spare, i, at(opacities, first + i) if first + i < n else 0.0)
-        opacity = load(spare, 0)
-    else:
-        opacity = load(opacities, first)
+    rows, start = _rows(opacities, first, n, 1, spare)
+    opacity = load(rows, start)
     if raw:
         odds_against = exp(-opacity)
         opacity = 1.0 / (1.0 + odds_against)

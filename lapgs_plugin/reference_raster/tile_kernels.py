@@ -102,12 +102,12 @@ def _aligned(size: int, like: Floats) -> Floats:
 
 
 @inline
-def _pixels_x(offsets: Floats, block: int, tile_x: int) -> Lanes:
+def pixels_x(offsets: Floats, block: int, tile_x: int) -> Lanes:
     return load(offsets, 2 * block * WIDTH) + tile_x * TILE
 
 
 @inline
-def _pixels_y(offsets: Floats, block: int, tile_y: int) -> Lanes:
+def pixels_y(offsets: Floats, block: int, tile_y: int) -> Lanes:
     return load(offsets, (2 * block + 1) * WIDTH) + tile_y * TILE
 
 
@@ -133,9 +133,16 @@ def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
 @inline
 def _distance(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> Lanes:
     """Return u^2 + v^2."""
+    u, v, _ = falloff(splats, s, dx, dy)
+    return fma(u, u, v * v)
+
+
+@inline
+def falloff(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Return u, v, and the logarithm of alpha before the cap, to base 2, at offsets from a splat's centre."""
     u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
     v = dy * broadcast(splats, s + FACTOR_YY)
-    return fma(u, u, v * v)
+    return u, v, fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
 
 
 # ------------------------------------------------------------------------------------------------ forward
@@ -204,7 +211,7 @@ def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: 
     """Set pixels to black and transparent; return the blocks, as bits, that hold pixels of the image."""
     alive = 0
     for block in range(BLOCKS):
-        inside = (_pixels_x(offsets, block, tile_x) < width) & (_pixels_y(offsets, block, tile_y) < height)
+        inside = (pixels_x(offsets, block, tile_x) < width) & (pixels_y(offsets, block, tile_y) < height)
         one, zero = splat(state, 1.0), splat(state, 0.0)
         store(state, (_FORWARD * block + _T) * WIDTH, select(inside, one, -one))
         for quantity in range(_R, _FORWARD):
@@ -252,15 +259,13 @@ def _blend_block(
     red, green, blue = (
         load(state, place + _R * WIDTH), load(state, place + _G * WIDTH), load(state, place + _B * WIDTH)
     )  # fmt: skip
-    x, y = _pixels_x(offsets, block, tile_x), _pixels_y(offsets, block, tile_y)
+    x, y = pixels_x(offsets, block, tile_x), pixels_y(offsets, block, tile_y)
     done = -1
     for j in range(at(counts, block)):
         pair = at(lists, block * BATCH + j)
         s = at(members, pair) * SPLAT
         dx, dy = x - broadcast(splats, s + CENTRE_X), y - broadcast(splats, s + CENTRE_Y)
-        u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
-        v = dy * broadcast(splats, s + FACTOR_YY)
-        exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+        _, _, exponent = falloff(splats, s, dx, dy)
         alpha = minimum(exp2(exponent), MAX_ALPHA)
         visible = exponent >= LOG2_MIN_ALPHA
         behind = fma(-alpha, t, t)
@@ -414,9 +419,9 @@ def _splat_backward(
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         place = _BACKWARD * block * WIDTH
-        # Loaded again in each block; kept in registers, these values would be spilled.
-        dx = _pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
-        dy = _pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
+        # As `falloff`, with xy and yy in registers. The others are loaded again in each block; they would be spilled.
+        dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
+        dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
         u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * xy)
         v = dy * yy
         exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))

@@ -16,7 +16,8 @@ class RenderOptions:
     device: str = option("auto", "cuda, cpu, or auto: CUDA if there is a CUDA device, else the CPU.")
     rasterizer: str = option(
         "auto",
-        "cpu, oracle, gsplat, or the module of an installed CUDA rasterizer such as diff_gaussian_rasterization. "
+        "cpu, oracle, gsplat, one of an installed package, or the module of an installed CUDA rasterizer such as "
+        "diff_gaussian_rasterization. "
         "auto: the rasterizer that the run was trained with, else gsplat, else cpu.",
     )
 

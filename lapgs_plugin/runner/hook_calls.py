@@ -10,6 +10,7 @@ term a gradient of one, as if the loop had added it.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,9 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks
+from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks, hooks_line
+
+logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from lapgs_plugin.runner.stage_rendering import StageRendering
@@ -37,6 +40,8 @@ class HookCaller:
 
     def __init__(self, hooks: Sequence[StageHook] = ()) -> None:
         found = (*entry_point_hooks(), *hooks)
+        if (line := hooks_line()) is not None:
+            logger.info("%s", line)
         self._hooks, self._any = HookDispatcher(found), bool(found)
         self._stage: Stage | None = None
         self._rendering: StageRendering | None = None

@@ -22,50 +22,29 @@ LOG_TICKS = 200
 
 
 @dataclass
-class CheckpointTimer:
-    """Tell when a checkpoint is due.
-
-    Attributes:
-        every: iterations between two; None for one every minute, over all stages.
-    """
-
-    every: int | None
-    _last: float = field(default_factory=time.monotonic)
-
-    def due(self, run: StageRun) -> bool:
-        """Return whether the last step made a checkpoint due."""
-        if self.every is not None:
-            return run.progress.iteration % self.every < run.step_views
-        return time.monotonic() - self._last >= CHECKPOINT_SECONDS
-
-    def saved(self) -> None:
-        """Note that a checkpoint was written."""
-        self._last = time.monotonic()
-
-
-@dataclass
 class BetweenSteps:
     """Do what the last step made due; none of it counts as optimization time.
 
     Attributes:
         context: of the run.
         evaluation: of the stage.
-        checkpoints: tells when one is due.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
-        test_every: as `Trainer` takes it.
+        test_every, checkpoint_every: as `Trainer` takes them.
         last_tick: seconds and iteration of the last tick, or of the start.
+        last_checkpoint: when it was written, or when the stage began, by `time.monotonic`.
     """
 
     context: RunContext
     evaluation: StageEvaluation
-    checkpoints: CheckpointTimer
     watcher: Watcher
     stop: StopRequest
     samples: Collection[int]
     test_every: int | None
+    checkpoint_every: int | None
     last_tick: tuple[float, int]
+    last_checkpoint: float = field(default_factory=time.monotonic)
 
     def __call__(self, run: StageRun) -> None:
         """Act on a step that has just ended.
@@ -90,7 +69,7 @@ class BetweenSteps:
             run.settle()
             with evaluation.overhead.timed("view"):
                 self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: stop.requested)
-        if stop.requested or self.checkpoints.due(run):
+        if stop.requested or self._checkpoint_is_due(run):
             self._save_checkpoint(run)
         if stop.requested:
             raise TrainingStoppedError(
@@ -115,10 +94,15 @@ class BetweenSteps:
         archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
         self.context.monitor.tick(run.stage, tick)
 
+    def _checkpoint_is_due(self, run: StageRun) -> bool:
+        if self.checkpoint_every is not None:
+            return run.progress.iteration % self.checkpoint_every < run.step_views
+        return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
+
     def _save_checkpoint(self, run: StageRun) -> None:
         best, overhead = self.evaluation.best, self.evaluation.overhead
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}
             self.context.archive.save_checkpoint(state, extends_to=self.context.settings.iterations)
-        self.checkpoints.saved()
+        self.last_checkpoint = time.monotonic()

@@ -181,7 +181,12 @@ class Densifier(DensityControl):
     def _gradient(self, result: RenderResult) -> Tensor:
         """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
         gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
-        assert gradient is not None, "no backward pass, or a rasterizer without absolute gradients"
+        if gradient is None:
+            source = "absgrad2d" if self._strategy.absgrad else "means2d.grad"
+            raise UserInputError(
+                f"--strategy densifies by the RenderResult's {source}, which this rasterizer leaves empty; choose "
+                "--strategy mcmc, which needs none, or another --rasterizer"
+            )
         return gradient
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:

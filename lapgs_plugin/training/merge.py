@@ -117,14 +117,14 @@ def first_field(fields: dict[int, GaussianField]) -> GaussianField:
     base.
     """
     base = fields[max(fields)]
-    degree = max(field.sh.shape[1] for field in fields.values())
+    count = max(field.sh.shape[1] for field in fields.values())
     tree = cKDTree(base.means.numpy())
-    parts = [replace(base, sh=_padded(base.sh, degree))]
+    parts = [replace(base, sh=_padded(base.sh, count))]
     for level in range(max(fields) - 1, -1, -1):
         residual = fields[level]
         nearest = torch.from_numpy(tree.query(residual.means.numpy())[1])
         faint = torch.logit((FAINT * torch.sigmoid(residual.opacity_logits)).clamp(1e-4, 1 - 1e-4))
-        sh = _padded(residual.sh, degree) + _padded(base.sh[nearest], degree)
+        sh = _padded(residual.sh, count) + _padded(base.sh[nearest], count)
         parts.append(replace(residual, opacity_logits=faint, sh=sh, signed=False))
     return parts[0].with_parameters(
         {name: torch.cat([part.parameters[name] for part in parts]) for name in parts[0].parameters}

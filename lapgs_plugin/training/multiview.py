@@ -14,6 +14,7 @@ import torch
 from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
@@ -111,7 +112,11 @@ class MultiviewDensifier(Densifier):
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of absolute gradients, too; see `DensityControl`."""
         super().accumulate(result, camera)
-        assert result.absgrad2d is not None, "a rasterizer without absolute gradients"
+        if result.absgrad2d is None:
+            raise UserInputError(
+                "--strategy multiview needs the RenderResult's absgrad2d, which this rasterizer leaves empty; choose "
+                "--strategy mcmc, which needs none, or another --rasterizer"
+            )
         if self.state["absgrad2d"] is None:
             self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
         size = camera.width, camera.height

@@ -34,6 +34,11 @@ def settings_from_manifest(manifest: Manifest, name: str = "the run's manifest")
     Raises:
         RunFolderError: they hold a key this version does not know, lack one, or one has another type.
     """
+    if "densification" not in manifest.settings:
+        raise RunFolderError(
+            f"{name}: the run was not started by `lapgs train`, which continues its own runs alone; continue it with "
+            "the program that made it, or train again with --overwrite"
+        )
     advice = "restore it or train again with --overwrite"
     values = {**manifest.settings, **{each: getattr(manifest, each) for each in IN_MANIFEST}}
     checked(values, _OldSettings, name, error=RunFolderError, advice=advice)

@@ -78,8 +78,7 @@ class LearningRates:
     def check(self) -> None:
         """Raise a UserInputError about a rate that is not positive."""
         for each in fields(self):
-            if not getattr(self, each.name) > 0:
-                raise UserInputError(f"{each.name} {getattr(self, each.name)}: expected a positive learning rate")
+            require_positive(each.name, getattr(self, each.name), "learning rate")
 
 
 @dataclass(frozen=True)
@@ -172,6 +171,7 @@ class TrainSettings(HierarchySettings):
         "has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         panel=SCHEDULE,
         names=("--accumulate-views", "--gather"),
+        least=1,
     )
     views_per_step: str = option(
         AUTO,
@@ -244,8 +244,6 @@ class TrainSettings(HierarchySettings):
         self._check_unused()
         self._check_exposure()
         _ = self.asked_views
-        if self.gather < 1:
-            raise UserInputError(f"--accumulate-views {self.gather}: expected at least 1, the views of one step")
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
@@ -426,8 +424,8 @@ class TrainingControl(MeasuringOptions):
 
     rasterizer: str = option(
         AUTO,
-        "gsplat (CUDA), cpu, or oracle (slow, plain PyTorch, for checking). auto: gsplat where there is a CUDA device, "
-        "else cpu.",
+        "gsplat (CUDA), cpu, oracle (slow, plain PyTorch, for checking), or one of an installed package. auto: gsplat "
+        "where there is a CUDA device, else cpu.",
         panel=RUN,
     )
     threads: int | None = option(

@@ -133,8 +133,9 @@ class StageRun:
             self._profile()
             start = time.perf_counter()
             self.breakdown.mark("other")
-            self.step_views = self.schedule.views_of_step(self.progress.iteration)
-            self._step(self._next(self.progress.iteration))
+            iterations = self._next(self.progress.iteration)
+            self.step_views = len(iterations)
+            self._step(iterations)
             self.breakdown.pause()
             self.progress.seconds += time.perf_counter() - start
             self.progress.iteration += self.step_views

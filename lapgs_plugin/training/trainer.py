@@ -15,7 +15,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
-from lapgs_plugin.hooks import HookDispatcher, StageHook
+from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
@@ -24,7 +24,7 @@ from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.between_steps import BetweenSteps, CheckpointTimer
+from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
@@ -111,7 +111,6 @@ class Trainer:
                     "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
                 )
         self._quality = QualityWatch()
-        self._checkpoints = CheckpointTimer(self.checkpoint_every)
 
     def run(self, resume: bool = False) -> None:
         """Train all stages that are not finished yet, or extend a finished run.
@@ -148,6 +147,8 @@ class Trainer:
         """Tell the user what the settings mean for this scene and device."""
         scene, say = self._context.scene, self.monitor.say
         say(self._strategy_line())
+        if (hooks := hooks_line()) is not None:
+            say(hooks)
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)
         if self.settings.dropout is None and (share := self.settings.dropout_for(len(scene.train))) > 0.0:
@@ -208,11 +209,11 @@ class Trainer:
             between_steps = BetweenSteps(
                 context=self._context,
                 evaluation=evaluation,
-                checkpoints=self._checkpoints,
                 watcher=self.watcher,
                 stop=stop,
                 samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
                 test_every=self.test_every,
+                checkpoint_every=self.checkpoint_every,
                 last_tick=(run.progress.seconds, run.progress.iteration),
             )
             run.hooks.on_stage_start(run.stage)
@@ -220,7 +221,7 @@ class Trainer:
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
             evaluation.return_to_best(run)
-            self._archive_stage(run, overhead, memory.note(images.bytes_on_device))
+            self._archive_stage(run, before, overhead, memory.note(images.bytes_on_device))
             self.watcher.stage_finished(run.stage, lambda: run.fields)
 
     def _model(self, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead) -> TrainableField:
@@ -320,12 +321,12 @@ class Trainer:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
-    def _archive_stage(self, run: StageRun, overhead: Overhead, memory: dict[str, int]) -> None:
-        """Archive a finished stage, or the longer training of one that was finished before."""
-        stage = run.stage
-        before = self._context.record_to_extend(self._context.plan[stage.level])
+    def _archive_stage(
+        self, run: StageRun, before: LevelRecord | None, overhead: Overhead, memory: dict[str, int]
+    ) -> None:
+        """Archive a finished stage, or the longer training of one that was finished before, with its record then."""
+        stage, field = run.stage, run.model.field.detach()
         used = {} if before is None else before.memory_bytes
-        field = run.model.field.detach()
         record = LevelRecord(
             level=stage.level,
             signed=stage.signed,

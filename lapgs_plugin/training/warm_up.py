@@ -17,12 +17,7 @@ from lapgs_plugin.training.settings import TrainSettings
 
 
 def warm_up(
-    rasterizer: Rasterizer,
-    settings: TrainSettings,
-    device: torch.device | str = "cpu",
-    *,
-    residuals: bool = False,
-    joint: bool = False,
+    rasterizer: Rasterizer, settings: TrainSettings, device: torch.device, *, residuals: bool, joint: bool
 ) -> None:
     """Run every kernel of an iteration once, so that compilation is not measured as training."""
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
@@ -31,7 +26,7 @@ def warm_up(
     camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
     result = rasterizer(model.field, camera, background=black)
     # Kernels of the loss are compiled for the types that targets and predictions are stored in.
-    on_gpu = torch.device(device).type == "cuda"
+    on_gpu = device.type == "cuda"
     target_types = (torch.uint8, torch.float16) if on_gpu else (result.image.dtype,)
     coarse = torch.zeros(3, 8, 8, device=device)
     rendered = [result.image, rasterizer.render_image(model.field, camera, background=black)]

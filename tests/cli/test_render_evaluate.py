@@ -39,6 +39,11 @@ def test_render_writes_every_image_of_the_held_out_views(run: Path) -> None:
     assert str(run / "renders") in output
 
 
+def test_the_log_says_which_rasterizer_renders(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lapgs("render", run, "--level", "1")
+    assert "rendering with cpu on" in caplog.text
+
+
 def test_exr_files_add_up_and_png_files_show_them(run: Path) -> None:
     lapgs("render", run, "--format", "exr")
     lapgs("render", run)

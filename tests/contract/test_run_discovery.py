@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+from argparse import Namespace
+from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -132,6 +134,25 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     with pytest.raises(UserInputError, match=r"training\(cfg, options, .* got no argument with source_path") as caught:
         TrainingCall.bind(training, (1, options, []), {})
     assert "\n" not in str(caught.value)
+
+
+def test_options_in_a_global_variable_name_the_output_folder_of_the_call() -> None:
+    """As DropGaussian's, whose dry run would otherwise write into the run's folder."""
+    names: dict[str, Any] = {"args": Namespace(model_path="out", quiet=True), "other": Namespace(quiet=True)}
+    exec(
+        "written = []\ndef training(dataset, opt, own):\n"
+        "    written.extend([args.model_path, own.model_path])\n    if opt.stop: raise KeyboardInterrupt",
+        names,
+    )
+    dataset = SimpleNamespace(source_path="scene", model_path="out/level_1")
+    for own in (names["args"], Namespace(model_path="out")):
+        opt = SimpleNamespace(iterations=30, stop=own is not names["args"])
+        call = TrainingCall.bind(names["training"], (dataset, opt, own), {})
+        with pytest.raises(KeyboardInterrupt) if opt.stop else nullcontext():
+            call.run()
+        assert (names["args"].model_path, own.model_path) == ("out", "out"), "put back"
+    assert names["written"] == ["out/level_1"] * 4
+    assert vars(names["other"]) == {"quiet": True}
 
 
 def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:

@@ -137,6 +137,33 @@ def test_what_is_rendered_has_to_be_what_is_archived(
     assert (tmp_path / "run").exists() != signed
 
 
+def test_what_a_renderer_does_in_training_alone_is_left_out_of_predictions_and_measurements(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As DropGaussian's, which leaves Gaussians out at random, more of them with each iteration."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    edits = {
+        "gaussian_renderer/__init__.py": [
+            ("    use_trained_exp=False,\n", "    use_trained_exp=False,\n    is_train=False,\n    iteration=None,\n"),
+            ("opacities=pc.get_opacity,", "opacities=pc.get_opacity * (0.9 ** (iteration / 2) if is_train else 1),"),
+        ],
+        "train.py": [
+            ("            bg,\n", "            bg,\n            is_train=True,\n            iteration=iteration,\n")
+        ],
+    }
+    for file, changes in edits.items():
+        text = (checkouts / "graphdeco" / file).read_text(encoding="utf-8")
+        for old, new in changes:
+            assert text.count(old) == 1
+            text = text.replace(old, new)
+        (checkouts / "graphdeco" / file).write_text(text, encoding="utf-8")
+    script, results = checkouts / "graphdeco" / "train.py", list[Result]()
+    with captured(tmp_path, results), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as one:
+        drive(one, levels=1, dry_run=True)
+    assert RunArchive.open(tmp_path / "run").manifest.complete
+    assert not [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+
+
 @pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
 def test_a_model_without_the_parameters_of_a_field(hierarchy: str, scene: Path, tmp_path: Path) -> None:
     """As of forks whose colours come from a network; their models have none of SH."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,18 +13,14 @@ import torch
 
 from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs import gpu_busy
-from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.training import trainer
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
@@ -52,20 +47,6 @@ class SlowHook(StageHook):
         time.sleep(DELAYS["other"])
 
 
-class StopAt(Monitor):
-    def __init__(self, iteration: int) -> None:
-        self._iteration = iteration
-
-    def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == (0, self._iteration):
-            signal.raise_signal(signal.SIGINT)
-
-
-def make_archive(path: Path, settings: TrainSettings) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    return RunArchive.create(path, Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest()))
-
-
 def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step = TrainableField.step
 
@@ -76,18 +57,9 @@ def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, m
     monkeypatch.setattr(TrainableField, "step", slow_step)
     monkeypatch.setattr(trainer, "require_cuda", lambda _: None)
     monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: 0.25)  # stands in for a GPU's profile
-    with make_archive(tmp_path / "run", SETTINGS) as archive:
-        Trainer(
-            ring_scene(),
-            SETTINGS,
-            archive,
-            SlowRasterizer(),
-            user_hooks=[SlowHook()],
-            breakdown=True,
-            gpu_busy=True,
-            test_every=3,
-        ).run()
-    for record in RunArchive.open(tmp_path / "run").manifest.records:
+    options = {"user_hooks": [SlowHook()], "breakdown": True, "gpu_busy": True, "test_every": 3}
+    archive = train(tmp_path / "run", ring_scene(), SETTINGS, SlowRasterizer(), **options)
+    for record in archive.manifest.records:
         assert record.gpu_busy_seconds == pytest.approx(0.25 * record.iterations / (record.iterations // 5))
         parts = record.breakdown_seconds
         assert tuple(parts) == PARTS
@@ -100,9 +72,7 @@ def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, m
 
 def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
     scene = ring_scene()
-    with make_archive(tmp_path / "whole", SETTINGS) as archive:
-        Trainer(scene, SETTINGS, archive, CpuRasterizer()).run()
-    whole = RunArchive.open(tmp_path / "whole")
+    whole = train(tmp_path / "whole", scene, SETTINGS)
     assert [record.breakdown_seconds for record in whole.manifest.records] == [{}, {}]
     for record in whole.manifest.records:
         counts = {e["iteration"]: e["num_gaussians"] for e in whole.history() if e["level"] == record.level}
@@ -111,30 +81,22 @@ def test_means_and_parts_continue_where_a_run_stopped(tmp_path: Path) -> None:
         assert first == pytest.approx(round(first), abs=1e-6)
         assert 0 < first <= record.peak_gaussians
     for measured_before in (True, False):
-        with make_archive(tmp_path / str(measured_before), SETTINGS) as archive:
-            trainer = Trainer(scene, SETTINGS, archive, CpuRasterizer(), monitor=StopAt(7), breakdown=measured_before)
-            with pytest.raises(TrainingStoppedError):
-                trainer.run()
-        said: list[str] = []
-        monitor = Monitor()
-        monitor.say = said.append  # type: ignore[method-assign]  # a listener of one method
-        with RunArchive.open(tmp_path / str(measured_before), resume=True) as archive:
-            Trainer(scene, SETTINGS, archive, CpuRasterizer(), monitor=monitor, breakdown=True).run(resume=True)
-        record = RunArchive.open(tmp_path / str(measured_before)).manifest.record(0)
+        folder, said = tmp_path / str(measured_before), Said()
+        with pytest.raises(TrainingStoppedError):
+            train(folder, scene, SETTINGS, monitor=StopAt(0, 7), breakdown=measured_before)
+        record = resume(folder, scene, SETTINGS, monitor=said, breakdown=True).manifest.record(0)
         assert record.mean_gaussians == whole.manifest.record(0).mean_gaussians
         if measured_before:
             assert math.fsum(record.breakdown_seconds.values()) == pytest.approx(record.train_seconds, rel=0.05)
-            assert said == []
+            assert said.lines == []
         else:
             assert record.breakdown_seconds == {}
-            assert "level 0 was started without --breakdown" in said[0]
+            assert "level 0 was started without --breakdown" in said.lines[0]
 
 
 def test_jointly_trained_fields_count(tmp_path: Path) -> None:
     settings = replace(SETTINGS, hierarchy="laplacian", joint=0.5)
-    with make_archive(tmp_path / "run", settings) as archive:
-        Trainer(ring_scene(), settings, archive, CpuRasterizer()).run()
-    archive = RunArchive.open(tmp_path / "run")
+    archive = train(tmp_path / "run", ring_scene(), settings)
     base, residual = archive.manifest.records
     counts = [entry["num_gaussians"] for entry in archive.history() if entry["level"] == 0]
     half = residual.iterations // 2
@@ -145,16 +107,11 @@ def test_jointly_trained_fields_count(tmp_path: Path) -> None:
 
 
 def test_measuring_changes_no_bit(tmp_path: Path) -> None:
-    scene, plys = ring_scene(), []
-    for breakdown in (False, True):
-        with make_archive(tmp_path / str(breakdown), replace(SETTINGS, seed=3)) as archive:
-            Trainer(scene, replace(SETTINGS, seed=3), archive, CpuRasterizer(), breakdown=breakdown).run()
-            plys.append([archive.field_path(level).read_bytes() for level in (1, 0)])
-    assert plys[0] == plys[1]
+    scene = ring_scene()
+    runs = [train(tmp_path / str(flag), scene, SETTINGS, breakdown=flag) for flag in (False, True)]
+    assert plys(runs[0]) == plys(runs[1])
 
 
 def test_writing_a_level_is_timed_by_the_archive(tmp_path: Path) -> None:
-    with make_archive(tmp_path / "run", SETTINGS) as archive:
-        Trainer(ring_scene(), SETTINGS, archive, CpuRasterizer()).run()
-    for record in RunArchive.open(tmp_path / "run").manifest.records:
+    for record in train(tmp_path / "run", ring_scene(), SETTINGS).manifest.records:
         assert 0 < record.overhead_seconds["archive"] < 10

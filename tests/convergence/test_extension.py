@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -22,14 +21,13 @@ from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import trainer
-from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
 BEFORE, AFTER = 40, 64
@@ -54,31 +52,15 @@ def scene() -> Scene:
     return ring_scene(train=12)
 
 
-class StopAt(Monitor):
-    """Stop the run, as Ctrl-C does, when the finest level reaches an iteration."""
-
-    def __init__(self, iteration: int) -> None:
-        self._iteration = iteration
-
-    def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == (0, self._iteration):
-            signal.raise_signal(signal.SIGINT)
-
-
 @pytest.fixture(scope="module", params=list(KINDS))
 def finished(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings, path = KINDS[request.param], tmp_path_factory.mktemp("finished") / "run"
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.create(path, manifest) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer()).run()
-    return path
+    return train(tmp_path_factory.mktemp("finished") / "run", scene, KINDS[request.param]).path()
 
 
 def extend(path: Path, scene: Scene, asked: int | None = AFTER, monitor: Monitor | None = None) -> None:
-    with RunArchive.open(path, resume=True) as archive:
-        settings = _extended(archive, settings_from_manifest(archive.manifest), asked)
-        Trainer(scene, settings, archive, CpuRasterizer(), monitor=monitor or Monitor()).run(resume=True)
+    archive = RunArchive.open(path)
+    settings = _extended(archive, settings_from_manifest(archive.manifest), asked)
+    resume(path, scene, settings, monitor=monitor or Monitor())
 
 
 def fails_at_the_manifest(self: RunArchive, name: str, values: dict[str, Any], training: bool = False) -> None:
@@ -88,8 +70,7 @@ def fails_at_the_manifest(self: RunArchive, name: str, values: dict[str, Any], t
 
 
 def contents(path: Path) -> list[bytes]:
-    archive = RunArchive.open(path)
-    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+    return plys(RunArchive.open(path))
 
 
 def quality(path: Path, scene: Scene) -> float:
@@ -132,7 +113,7 @@ def test_an_interrupted_extension_leaves_the_run_and_continues(finished: Path, s
     extend(whole, scene)
     stop = RunArchive.open(finished).manifest.records[-1].iterations + 11
     with pytest.raises(TrainingStoppedError):
-        extend(parts, scene, monitor=StopAt(stop))
+        extend(parts, scene, monitor=StopAt(0, stop))
     assert contents(parts) == contents(finished)
     assert RunArchive.open(parts).manifest == RunArchive.open(finished).manifest
     with pytest.raises(UserInputError, match=f"--iterations {AFTER + 1}: .* is being extended to {AFTER}; leave"):

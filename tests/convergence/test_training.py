@@ -24,13 +24,12 @@ from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.trainer import Trainer
 from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
+from tests.training_runs import StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
@@ -51,32 +50,6 @@ def scene() -> Scene:
     return ring_scene()
 
 
-def make_archive(path: Path, settings: TrainSettings) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    return RunArchive.create(path, Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest()))
-
-
-def train(path: Path, scene: Scene, settings: TrainSettings = SETTINGS, **options: object) -> RunArchive:
-    with make_archive(path, settings) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer(), **options).run()
-    return RunArchive.open(path)
-
-
-def plys(archive: RunArchive) -> list[bytes]:
-    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
-
-
-class StopAt(Monitor):
-    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
-
-    def __init__(self, level: int, iteration: int) -> None:
-        self._place = (level, iteration)
-
-    def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == self._place:
-            signal.raise_signal(signal.SIGINT)
-
-
 def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path: Path) -> None:
     calm = Densification(start=20, until=150, every=20, reset_every=10_000)
     archive = train(tmp_path / "run", scene, replace(SETTINGS, iterations=300, densification=calm))
@@ -91,7 +64,7 @@ def test_a_hierarchy_learns_and_its_residual_adds_detail(scene: Scene, tmp_path:
     assert archive.manifest.complete
     assert not archive.field(1).signed
     assert archive.field(0).signed
-    assert not archive.path("checkpoint.pt").exists()
+    assert not archive.path(CHECKPOINT).exists()
 
 
 def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Path) -> None:
@@ -104,8 +77,8 @@ def test_one_level_is_an_unsigned_field_at_full_size(scene: Scene, tmp_path: Pat
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(scene: Scene, tmp_path: Path) -> None:
-    first = plys(train(tmp_path / "a", scene))
-    assert first == plys(train(tmp_path / "b", scene))
+    first = plys(train(tmp_path / "a", scene, SETTINGS))
+    assert first == plys(train(tmp_path / "b", scene, SETTINGS))
     assert first != plys(train(tmp_path / "c", scene, replace(SETTINGS, seed=1)))
 
 
@@ -121,14 +94,11 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     scene: Scene, tmp_path: Path, whole: RunArchive, level: int, iteration: int
 ) -> None:
     settings = settings_from_manifest(whole.manifest)
-    with make_archive(tmp_path / "parts", settings) as archive:
-        trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(level, iteration))
-        with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
-            trainer.run()
-    with RunArchive.open(tmp_path / "parts", resume=True) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
-        assert plys(archive) == plys(whole)
-        places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
+    with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
+        train(tmp_path / "parts", scene, settings, monitor=StopAt(level, iteration))
+    archive = resume(tmp_path / "parts", scene, settings)
+    assert plys(archive) == plys(whole)
+    places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
 
 
@@ -139,17 +109,15 @@ def test_an_older_run_with_residuals_still_resets_opacities_in_them(scene: Scene
     settings = replace(SETTINGS, iterations=480, split="1/4,3/4", densification=density, residual_resets=True)
     whole = train(tmp_path / "whole", scene, settings)
     run = tmp_path / "older"
-    with make_archive(run, settings) as archive, pytest.raises(TrainingStoppedError):
-        Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(0, 200)).run()
+    with pytest.raises(TrainingStoppedError):
+        train(run, scene, settings, monitor=StopAt(0, 200))
     manifest = json.loads((run / "manifest.json").read_text())
     assert manifest["settings"].pop("residual_resets")
     flat = manifest["settings"]["densification"]
     flat |= flat.pop("options") | {"cap_max": 1_000_000, "base_cap_max": None, "error_pixels": 0.1}
     (run / "manifest.json").write_text(json.dumps(manifest))
-    with RunArchive.open(run, resume=True) as archive:
-        older = settings_from_manifest(archive.manifest)
-        Trainer(scene, older, archive, CpuRasterizer()).run(resume=True)
-        assert plys(archive) == plys(whole)
+    older = settings_from_manifest(RunArchive.open(run).manifest)
+    assert plys(resume(run, scene, older)) == plys(whole)
     without = train(tmp_path / "without", scene, replace(settings, residual_resets=False))
     assert plys(without) != plys(whole), "the reset after 300 of the residual's 360 iterations makes a difference"
 
@@ -164,17 +132,16 @@ def large() -> Scene:
 def two_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of three levels that was stopped in its last and lost its checkpoint."""
     path = tmp_path_factory.mktemp("two") / "run"
-    with make_archive(path, SHORT) as archive:
-        with pytest.raises(TrainingStoppedError):
-            Trainer(large, SHORT, archive, CpuRasterizer(), monitor=StopAt(0, 1)).run()
-        archive.path("checkpoint.pt").unlink()
+    with pytest.raises(TrainingStoppedError):
+        train(path, large, SHORT, monitor=StopAt(0, 1))
+    (path / CHECKPOINT).unlink()
     return path
 
 
-def resume(path: Path, scene: Scene, **options: object) -> RunArchive:
-    with RunArchive.open(path, resume=True) as archive:
-        Trainer(scene, SHORT, archive, CpuRasterizer(), **options).run(resume=True)
-    return RunArchive.open(path)
+@pytest.fixture(scope="module")
+def all_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
+    """Return the run that `two_finished` would have become."""
+    return train(tmp_path_factory.mktemp("all") / "run", large, SHORT)
 
 
 def files(folder: Path) -> set[Path]:
@@ -182,41 +149,39 @@ def files(folder: Path) -> set[Path]:
 
 
 def test_a_run_killed_while_it_archives_jointly_trained_fields_ends_as_others(
-    large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
+    large: Scene, tmp_path: Path, two_finished: Path, all_finished: RunArchive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Kill it at any write after the last stage, and resume it."""
-    whole = train(tmp_path / "whole", large, SHORT)
     base = [(two_finished / f"level_{level}" / "point_cloud.ply").read_bytes() for level in (2, 1)]
-    assert plys(whole)[0] != base[0], "the coarser fields were trained along"
-    assert plys(whole)[1] != base[1]
+    assert plys(all_finished)[0] != base[0], "the coarser fields were trained along"
+    assert plys(all_finished)[1] != base[1]
     writes = FailingWrites(monkeypatch, Killed)
     left, done = 0, False
     while not done:
         folder = shutil.copytree(two_finished, tmp_path / str(left))
         with contextlib.suppress(Killed):
-            resume(folder, large, user_hooks=[FailAfterStage(writes, 0, left)])
+            resume(folder, large, SHORT, user_hooks=[FailAfterStage(writes, 0, left)])
             done = True
         writes.left = sys.maxsize
         killed = RunArchive.open(folder)
-        assert plys(killed) == (plys(whole) if killed.manifest.complete else base)
-        again = resume(folder, large)
-        assert plys(again) == plys(whole)
-        assert files(folder) == files(whole.path())
+        assert plys(killed) == (plys(all_finished) if killed.manifest.complete else base)
+        again = resume(folder, large, SHORT)
+        assert plys(again) == plys(all_finished)
+        assert files(folder) == files(all_finished.path())
         left += 1
     assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
 
 
 def test_a_disk_that_is_full_when_a_stage_ends_keeps_the_fields_before_it(
-    large: Scene, tmp_path: Path, two_finished: Path, monkeypatch: pytest.MonkeyPatch
+    large: Scene, tmp_path: Path, two_finished: Path, all_finished: RunArchive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = train(tmp_path / "whole", large, SHORT)
     folder = shutil.copytree(two_finished, tmp_path / "run")
     writes = FailingWrites(monkeypatch, disk_full)
     with pytest.raises(RunFolderError, match=r"No space left.*what was finished before is unharmed"):
-        resume(folder, large, user_hooks=[FailAfterStage(writes, 0, 4)])  # in the second PLY
+        resume(folder, large, SHORT, user_hooks=[FailAfterStage(writes, 0, 4)])  # in the second PLY
     writes.left = sys.maxsize
     assert plys(RunArchive.open(folder)) == plys(RunArchive.open(two_finished))
-    assert plys(resume(folder, large)) == plys(whole)
+    assert plys(resume(folder, large, SHORT)) == plys(all_finished)
 
 
 @pytest.mark.parametrize("levels", [2, 3])
@@ -253,15 +218,13 @@ def test_residuals_supervised_alone_do_not_change_finished_fields(scene: Scene, 
     assert plys(with_share) == plys(train(tmp_path / "b", scene, replace(settings, joint=0.0)))
 
 
-def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, inherit="full")
-    whole = train(tmp_path / "whole", scene, settings)
-    with make_archive(tmp_path / "parts", settings) as archive:
-        with pytest.raises(TrainingStoppedError):
-            Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(0, 10)).run()
-        archive.path("checkpoint.pt").unlink()
-        Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
-        assert plys(archive) == plys(whole)
+@pytest.mark.parametrize("whole", ["full"], indirect=True)
+def test_full_inheritance_survives_the_loss_of_its_checkpoint(scene: Scene, tmp_path: Path, whole: RunArchive) -> None:
+    settings, parts = settings_from_manifest(whole.manifest), tmp_path / "parts"
+    with pytest.raises(TrainingStoppedError):
+        train(parts, scene, settings, monitor=StopAt(0, 10))
+    (parts / CHECKPOINT).unlink()
+    assert plys(resume(parts, scene, settings)) == plys(whole)
 
 
 def nested(settings: TrainSettings = SETTINGS) -> TrainSettings:
@@ -316,16 +279,16 @@ def test_nested_levels_learn(scene: Scene, tmp_path: Path) -> None:
 def test_adam_continues_from_the_coarser_level(scene: Scene, tmp_path: Path) -> None:
     """With its moments and count of steps, also in a run that lost its checkpoint."""
     whole = train(tmp_path / "whole", scene, nested())
-    with make_archive(tmp_path / "parts", nested()) as archive:
-        with pytest.raises(TrainingStoppedError):
-            Trainer(scene, nested(), archive, CpuRasterizer(), monitor=StopAt(0, 10)).run()
-        before, after = archive.optimizer_state(1), archive.load_checkpoint()["model"]["moments"]
-        assert before.keys() == after.keys() == {"means", "quats", "scales", "opacities", "sh"}
-        for name in before:
-            assert int(after[name]["step"]) == int(before[name]["step"]) + 10
-        archive.path("checkpoint.pt").unlink()
-        Trainer(scene, nested(), archive, CpuRasterizer()).run(resume=True)
-        assert plys(archive) == plys(whole)
+    parts = tmp_path / "parts"
+    with pytest.raises(TrainingStoppedError):
+        train(parts, scene, nested(), monitor=StopAt(0, 10))
+    archive = RunArchive.open(parts)
+    before, after = archive.optimizer_state(1), archive.load_checkpoint()["model"]["moments"]
+    assert before.keys() == after.keys() == {"means", "quats", "scales", "opacities", "sh"}
+    for name in before:
+        assert int(after[name]["step"]) == int(before[name]["step"]) + 10
+    (parts / CHECKPOINT).unlink()
+    assert plys(resume(parts, scene, nested())) == plys(whole)
 
 
 class Below(StageHook):
@@ -431,10 +394,8 @@ def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, 
         def compose(self, context: StageContext, image: torch.Tensor) -> torch.Tensor:
             return image * math.nan if (context.stage.level, context.iteration) == (0, 23) else image
 
-    with make_archive(tmp_path / "run", SETTINGS) as archive:
-        trainer = Trainer(scene, SETTINGS, archive, CpuRasterizer(), user_hooks=[Poison()], checkpoint_every=10)
-        with pytest.raises(TrainingDivergedError, match="level 0, iteration 23: the loss is nan"):
-            trainer.run()
+    with pytest.raises(TrainingDivergedError, match="level 0, iteration 23: the loss is nan"):
+        train(tmp_path / "run", scene, SETTINGS, user_hooks=[Poison()], checkpoint_every=10)
     archive = RunArchive.open(tmp_path / "run")
     assert archive.available_levels == (1,)
     checkpoint = archive.load_checkpoint()

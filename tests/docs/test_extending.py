@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import importlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -21,15 +20,16 @@ from torch import Tensor
 import lapgs_plugin
 from lapgs_plugin import ops
 from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.hooks import HookDispatcher, StageContext, entry_point_hooks
+from lapgs_plugin.hooks import HookDispatcher, StageContext, entry_point_hooks, hooks_line
 from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
+from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training.strategies import STRATEGIES
-from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
 
 try:
@@ -66,7 +66,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
         del sys.modules[name]
 
 
-REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES)
+REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES, RASTERIZERS)
 
 
 def context(signed: bool) -> StageContext:
@@ -84,6 +84,7 @@ def test_each_is_under_forty_lines(name: str) -> None:
 def test_the_hook_adds_to_the_loss_of_residual_stages() -> None:
     (hook,) = entry_point_hooks()
     assert type(hook).__name__ == "Smooth"
+    assert hooks_line() == "hooks of installed packages: smooth (my_extension.hooks:Smooth)"
     image = torch.zeros(3, 6, 8)
     image[:, 3:] = 1.0  # one edge, across 8 of 5 * 8 vertical steps
     term = HookDispatcher([hook]).extra_loss(context(signed=True), image)
@@ -118,7 +119,7 @@ def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path
     assert (view.blur, original.blur) == (2.0, 4.0)
 
 
-def test_the_strategy_trains_with_its_option(installed: Path, tmp_path: Path) -> None:
+def test_the_strategy_and_the_rasterizer_train_by_name(installed: Path, tmp_path: Path) -> None:
     scene, run = tmp_path / "scene", tmp_path / "run"
     make_sample_scene(scene, width=64, height=48, views=6, points=300, progress=False)
     words = (
@@ -132,6 +133,8 @@ def test_the_strategy_trains_with_its_option(installed: Path, tmp_path: Path) ->
         "opaque",
         "--duplicates",
         "7",
+        "--rasterizer",
+        "discs",
     )
     done = subprocess.run(
         [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, *words],
@@ -141,9 +144,32 @@ def test_the_strategy_trains_with_its_option(installed: Path, tmp_path: Path) ->
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    added = lapgs_plugin.RunArchive.open(run).manifest.record(0).num_gaussians - 300
+    assert "smooth (my_extension.hooks:Smooth)" in done.stdout + done.stderr
+    manifest = lapgs_plugin.RunArchive.open(run).manifest
+    assert manifest.rasterizer == "discs"
+    added = manifest.record(0).num_gaussians - 300
     assert added > 0
     assert added % 7 == 0
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_rasterizer_blends_front_to_back_and_leaves_statistics() -> None:
+    camera = lapgs_plugin.Camera(5, 3, 10.0, 10.0, 2.5, 1.5, torch.eye(4))
+    far, near = (0.0, 0.0, 2.0), (0.0, 0.0, 1.0)  # both in the middle of the middle pixel
+    field = lapgs_plugin.GaussianField(
+        means=torch.tensor([far, near], requires_grad=True),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        log_scales=torch.zeros(2, 3),
+        opacity_logits=torch.zeros(2),
+        sh=torch.tensor([[[1.0, 0, 0]], [[0, 1.0, 0]]]) / SH_C0,
+        signed=True,
+    )
+    result = RASTERIZERS["discs"]()(field, camera, background=torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(result.image[:, 1, 2], torch.tensor([0.25, 0.5, 0.25]))
+    assert result.radii.tolist() == [16, 31]  # three times 10 / 2 + 0.3 and 10 / 1 + 0.3
+    result.image[:, :, 3:].sum().backward()
+    assert result.means2d.grad is not None
+    assert result.means2d.grad.shape == (2, 2)
 
 
 @pytest.fixture
@@ -172,10 +198,10 @@ def test_the_operation_is_one_kernel_on_a_gpu(tone: Any) -> None:
 def test_no_file_on_the_page_is_without_a_test() -> None:
     package = {
         "pyproject.toml",
-        *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy")),
+        *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy", "rasterizer")),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
-    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml", "render_a_run.py"}
+    assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml"}
 
 
 def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> None:
@@ -189,27 +215,3 @@ def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> No
     text = change.after.decode()
     assert "#include <cfloat>" in text
     assert "degree < 0 ? colour : max(colour + 0.5f, 0.0f)" in text
-
-
-def test_a_run_is_rendered_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_scene(tmp_path / "data/mine")
-    write_run(tmp_path / "runs/mine", scene)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(FILES["render_a_run.py"], "render_a_run.py", "exec"), names)
-    camera, images = names["view"].camera, names["images"]
-    assert images.composed[0].shape == (3, camera.height, camera.width)
-    up = lapgs_plugin.Pyramid().up(images.base, (camera.height, camera.width))
-    torch.testing.assert_close(images.composed[0], up + images.residuals[0], rtol=0, atol=1e-5)
-
-
-def test_the_pieces_of_a_loop_are_names_of_the_package() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    table = text[text.index("| piece | for |") : text.index("[gsplat_after.py]")]
-    named = {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)", row)}
-    assert len(named) > 8
-    assert named <= set(lapgs_plugin.__all__)
-    for piece, method in re.findall(r"`([A-Z]\w+)\.(\w+)", table):
-        assert hasattr(getattr(lapgs_plugin, piece), method)
-    for method in ("put", "prefetch", "get"):
-        assert hasattr(lapgs_plugin.ImageStore, method)

@@ -10,15 +10,23 @@ from pathlib import Path
 SMOKE = Path(__file__).parents[2] / "benchmarks" / "smoke.toml"
 
 
+SAMPLE = 'size = "240x160", views = 24, points = 2000'
+SMALLER = 'size = "96x64", views = 9, points = 300'
+
+
 def test_the_smoke_experiment_runs_from_end_to_end(tmp_path: Path) -> None:
-    out = tmp_path / "smoke"
-    command = [sys.executable, "-m", "lapgs_plugin", "bench", str(SMOKE), "--seeds", "0", "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    """With its first and last variant, on a smaller scene."""
+    text, out = SMOKE.read_text(), tmp_path / "smoke"
+    assert SAMPLE in text
+    (tmp_path / "smoke.toml").write_text(text.replace(SAMPLE, SMALLER))
+    variants = ["one field", "three levels of residuals"]
+    words = ["bench", str(tmp_path / "smoke.toml"), "--seeds", "0", "--iterations", "100", "--out", str(out)]
+    words += [word for variant in variants for word in ("--variant", variant)]
+    done = subprocess.run([sys.executable, "-m", "lapgs_plugin", *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     with (out / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    variants = ["one field", "two nested levels", "two levels of residuals", "three levels of residuals"]
     assert [row["variant"] for row in rows] == variants
-    assert all(float(row["psnr"]) > 14 for row in rows)  # seen 14.95 to 15.44
+    assert all(float(row["psnr"]) > 14 for row in rows)  # seen 14.69 and 14.74
     tables = (out / "tables.md").read_text()
     assert all(f"| {variant} |" in tables for variant in variants)

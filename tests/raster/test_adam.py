@@ -138,7 +138,7 @@ def test_columns_that_become_active_later_train_as_if_they_always_had_been() -> 
 def test_inactive_columns_are_left_alone() -> None:
     param = parameter(SH_SHAPE)
     before = param.detach().clone()
-    optimizer = FieldAdam([param], lr=1e-2, active_columns=4)
+    optimizer = FieldAdam([{"params": [param], "active_columns": 4}], lr=1e-2)
     descend(optimizer, list(gradients(SH_SHAPE, 3, torch.float32)))
     assert torch.equal(param[:, 4:], before[:, 4:])
     assert not optimizer.state[param]["exp_avg"][:, 4:].any()
@@ -166,7 +166,8 @@ def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
 
 def test_resuming_from_a_saved_state_gives_the_same_bits() -> None:
     values = list(gradients(SH_SHAPE, 20, torch.float32))
-    through = FieldAdam([parameter(SH_SHAPE)], lr=1e-2, column_scale=sh_scale(), active_columns=9)
+    group = {"params": [parameter(SH_SHAPE)], "active_columns": 9}
+    through = FieldAdam([group], lr=1e-2, column_scale=sh_scale())
     descend(through, values[:10])
     halfway = copy.deepcopy(through.param_groups[0]["params"][0])
     resumed = FieldAdam([halfway], lr=1.0)
@@ -227,17 +228,10 @@ def test_a_parameter_without_gradient_or_without_rows_is_left_alone() -> None:
     assert param not in optimizer.state
 
 
-def test_step_returns_what_its_closure_does() -> None:
-    param = parameter((4, 3))
-    param.grad = torch.ones(4, 3)
-    assert FieldAdam([param], lr=1e-2).step(lambda: 7.0) == 7.0
-
-
 @pytest.mark.parametrize(
     ("param", "options", "message"),
     [
         (torch.zeros(4, 3), {"lr": -1.0}, "lr -1.0"),
-        (torch.zeros(4, 3), {"betas": (0.9, 1.0)}, r"betas \(0.9, 1.0\)"),
         (
             torch.zeros(4, 3),
             {"column_scale": torch.ones(4)},
@@ -253,4 +247,4 @@ def test_refuses_what_it_cannot_optimize(param: Tensor, options: dict[str, Any],
     param.requires_grad_()
     param.grad = torch.zeros_like(param)
     with pytest.raises(UserInputError, match=message):
-        FieldAdam([param], **{"lr": 1e-2, **options}).step()
+        FieldAdam([{"params": [param], **options}], lr=options.get("lr", 1e-2)).step()

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from lapgs_plugin.jit import buffers
+from lapgs_plugin.jit import buffers, compiler
 from lapgs_plugin.jit.threads import num_threads, one_pool, parallel
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.fast import CpuRasterizer
@@ -305,6 +305,20 @@ def test_compilation_is_reported_once_and_repeated_only_after_a_change(copied_pa
     with (copied_package / "lapgs_plugin" / "jit" / "lanes.py").open("a") as file:
         file.write("# a change\n")
     assert MESSAGE in run_python(TWO_TYPES_OF_A_SMALL_KERNEL, copied_package)
+
+
+@pytest.mark.parametrize("name", ["layout.py", "in_torch.py", "tile_kernels.py"])
+@pytest.mark.parametrize("place", ["", "inside"])
+def test_compiled_code_is_as_old_as_what_it_was_compiled_from(name: str, place: str, tmp_path: Path) -> None:
+    """SSIM's constants, for example, are in `in_torch`; compiled kernels hold their values."""
+    stamp = compiler._helpers_stamp.__wrapped__
+    (tmp_path / "inside").mkdir()
+    file = tmp_path / place / name
+    file.write_text("A = 1")
+    before = stamp(tmp_path / "inside")
+    assert stamp(tmp_path / "inside") == before
+    file.write_text("A = 2")
+    assert stamp(tmp_path / "inside") != before
 
 
 NOWHERE = """

@@ -20,6 +20,7 @@ from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer, project
 from lapgs_plugin.reference_raster.standins import BACKBONES, VARIANTS, install, stand_ins
 from tests.raster.scenes import COLORED, Case, make_camera, random_case, to_world
+from tests.raster.standin_cases import covariances
 
 SPLIT = {"graphdeco-accel", "taming", "taming-rasterizer", "fastgs"}
 
@@ -233,16 +234,7 @@ def test_taming_without_two_rows_of_weights_gives_empty_sums(rows: int | None) -
 
 def covariance_of(case: Case) -> Tensor:
     """(n, 6) covariances of a field, differentiable."""
-    w, x, y, z = normalize(case.field.quaternions).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    rotation = torch.stack(rows, 1).reshape(-1, 3, 3)
-    full = rotation @ torch.diag_embed((2 * case.field.log_scales).exp()) @ rotation.mT
-    upper = torch.triu_indices(3, 3)
-    return full[:, upper[0], upper[1]]
+    return covariances({"quats": normalize(case.field.quaternions), "scales": case.field.log_scales.exp()})
 
 
 @pytest.mark.parametrize("variant", ["graphdeco", "fastgs"])

@@ -19,14 +19,12 @@ import torch
 
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import resume, train
 from tests.training_scene import ring_scene
 
 SETTINGS = TrainSettings(
@@ -61,16 +59,9 @@ def scene() -> Scene:
 def stopped(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run that was stopped in its last stage."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **SETTINGS.for_manifest())
-    with RunArchive.create(folder, manifest) as archive, pytest.raises(TrainingStoppedError):
-        Trainer(scene, SETTINGS, archive, CpuRasterizer(), monitor=StopInTheEnd()).run()
+    with pytest.raises(TrainingStoppedError):
+        train(folder, scene, SETTINGS, monitor=StopInTheEnd())
     return folder
-
-
-def resume(folder: Path, scene: Scene) -> None:
-    with RunArchive.open(folder, resume=True) as archive:
-        Trainer(scene, SETTINGS, archive, CpuRasterizer()).run(resume=True)
 
 
 def put(saved: Any, value: Any, *keys: Any) -> Any:
@@ -192,7 +183,7 @@ def test_a_damaged_checkpoint_is_one_line(name: str, stopped: Path, scene: Scene
         damaged = path.read_bytes()
         history = (stopped / "history.jsonl").read_bytes()
         with pytest.raises(RunFolderError, match=message) as caught:
-            resume(stopped, scene)
+            resume(stopped, scene, SETTINGS)
         assert "\n" not in str(caught.value)
         assert str(path) in str(caught.value)
         assert "delete it to continue from the last finished level" in str(caught.value)
@@ -241,7 +232,7 @@ def test_files_that_torch_did_not_write(
         path.write_bytes(contents())
         tracemalloc.start()
         with pytest.raises(RunFolderError, match=rf"checkpoint\.pt cannot be read \(.*{message}.*; delete it"):
-            resume(stopped, scene)
+            resume(stopped, scene, SETTINGS)
         assert tracemalloc.get_traced_memory()[1] < 10 * 2**20  # 0.3 MiB seen
     finally:
         tracemalloc.stop()
@@ -266,7 +257,7 @@ def test_a_damaged_optimizer_state_is_one_line(
         checkpoint.unlink()
         torch.save(make(torch.load(path, weights_only=True)), path)
         with pytest.raises(RunFolderError, match=message) as caught:
-            resume(stopped, scene)
+            resume(stopped, scene, SETTINGS)
         assert "start again with --overwrite" in str(caught.value)
     finally:
         checkpoint.write_bytes(kept[0])
@@ -277,16 +268,13 @@ def test_a_damaged_optimizer_state_is_one_line(
 def test_a_base_with_fewer_harmonics_is_resumed(level: int, scene: Scene, tmp_path: Path) -> None:
     """In its own stage, and in that of the residual, which trains it jointly."""
     settings = replace(SETTINGS, inherit="geometry", base_sh_degree=0)
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.create(tmp_path / "run", manifest) as archive:
-        with pytest.raises(TrainingStoppedError):
-            Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopInTheEnd(level)).run()
-        Trainer(scene, settings, archive, CpuRasterizer()).run(resume=True)
-        assert [archive.field(each).sh_degree for each in (1, 0)] == [0, 1]
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, settings, monitor=StopInTheEnd(level))
+    archive = resume(tmp_path / "run", scene, settings)
+    assert [archive.field(each).sh_degree for each in (1, 0)] == [0, 1]
 
 
 def test_the_checkpoint_itself_is_fine(stopped: Path, scene: Scene) -> None:
     """Last in this file, because the run ends."""
-    resume(stopped, scene)
+    resume(stopped, scene, SETTINGS)
     assert RunArchive.open(stopped).manifest.complete

@@ -11,11 +11,10 @@ import torch
 from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.training import stage
 from lapgs_plugin.training.dropout import thinned
-from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Mcmc
-from tests.training_scene import blob_field
-from tests.unit.test_quality_watch import Said, StopAt, ring_scene, train
+from tests.training_runs import Said, StopAt, resume, train
+from tests.training_scene import blob_field, ring_scene
 
 MCMC = Densification(strategy="mcmc", options=Mcmc(), every=10)
 
@@ -64,12 +63,12 @@ def test_few_photos_get_it_with_mcmc() -> None:
 def test_a_stopped_run_leaves_out_the_same_ones(tmp_path: Path) -> None:
     scene = ring_scene(train=4, test=1)
     settings, said = TrainSettings(iterations=24, sh_degree=0, densification=MCMC), Said()
-    whole = train(scene, settings, tmp_path / "whole", said)
+    whole = train(tmp_path / "whole", scene, settings, monitor=said)
     assert "4 training views are few: --dropout 0.2 leaves Gaussians out at random" in said.lines
-    other = train(scene, TrainSettings(**{**vars(settings), "dropout": 0.0}), tmp_path / "other", Monitor())
+    other = train(tmp_path / "other", scene, replace(settings, dropout=0.0))
     with pytest.raises(TrainingStoppedError):
-        train(scene, settings, tmp_path / "stopped", StopAt((0, 6)))
-    again = train(scene, settings, tmp_path / "stopped", Monitor(), resume=True)
+        train(tmp_path / "stopped", scene, settings, monitor=StopAt(0, 6))
+    again = resume(tmp_path / "stopped", scene, settings)
     assert bool((again.field(0).means == whole.field(0).means).all())
     assert not bool((other.field(0).means == whole.field(0).means).all())
 
@@ -77,7 +76,7 @@ def test_a_stopped_run_leaves_out_the_same_ones(tmp_path: Path) -> None:
 def test_an_extension_leaves_out_as_many_as_the_end_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, shares = ring_scene(train=4, test=1), list[float]()
     settings = TrainSettings(iterations=12, levels=1, sh_degree=0, densification=MCMC)
-    train(scene, settings, tmp_path / "run", Monitor())
+    train(tmp_path / "run", scene, settings)
     monkeypatch.setattr(stage, "thinned", lambda field, share: shares.append(share) or thinned(field, share))
-    train(scene, replace(settings, iterations=16, extended=4), tmp_path / "run", Monitor(), resume=True)
+    resume(tmp_path / "run", scene, replace(settings, iterations=16, extended=4))
     assert shares == [0.2] * 4

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,22 +16,19 @@ from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputE
 from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.evaluation.lpips import LpipsRequest
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, fit_colors, psnr
-from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.color_transform import transform_colors
-from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
+from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities
-from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import TrainSettings
-from lapgs_plugin.training.trainer import Trainer
 from tests.cli.run_folder import write_run, write_scene
+from tests.training_runs import StopAt, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
 STOPS = (0.0, 0.9, -0.7, 0.4, -0.5, 0.2)
@@ -109,7 +105,7 @@ def test_transforms_learn_the_gains_of_photos_and_their_mean_stays_the_identity(
 def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
     scene = wall_scene(STOPS)
     settings = TrainSettings(iterations=60, hierarchy=hierarchy, exposure="on", sh_degree=0)
-    whole = train(scene, settings, tmp_path / "whole")
+    whole = train(tmp_path / "whole", scene, settings)
     archived = whole.exposure(0)
     assert archived is not None
     gains = torch.tensor([archived[view.name] for view in scene.train])[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
@@ -120,8 +116,8 @@ def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_
     for stop_at in ((1, 20), (0, 10)):
         folder = tmp_path / f"stopped_{stop_at[0]}"
         with pytest.raises(TrainingStoppedError):
-            train(scene, settings, folder, stop_at)
-        assert train(scene, settings, folder, resume=True).exposure(0) == archived
+            train(folder, scene, settings, monitor=StopAt(*stop_at))
+        assert resume(folder, scene, settings).exposure(0) == archived
         for level in (0, 1):
             mine, theirs = (RunArchive.open(path).field(level).means for path in (folder, tmp_path / "whole"))
             assert (mine == theirs).all()
@@ -130,43 +126,19 @@ def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_
 def test_compensation_beats_none_where_exposure_changes_and_is_left_out_where_it_does_not(tmp_path: Path) -> None:
     found = {}
     for choice in ("on", "off"):
-        archive = train(wall_scene(STOPS), TrainSettings(iterations=200, exposure=choice, levels=1), tmp_path / choice)
+        archive = train(tmp_path / choice, wall_scene(STOPS), TrainSettings(iterations=200, exposure=choice, levels=1))
         assert (archive.exposure(0) is None) == (choice == "off")
         found[choice] = archive.history()[-1]["loss"]
     assert found["on"] < 0.8 * found["off"]  # worst seen 0.6 of it
-    archive = train(wall_scene((0.0,) * 6), TrainSettings(iterations=12), tmp_path / "auto")
+    archive = train(tmp_path / "auto", wall_scene((0.0,) * 6), TrainSettings(iterations=12))
     assert archive.exposure(0) is None
-    archive = train(wall_scene(STOPS), TrainSettings(iterations=12), tmp_path / "changing")
+    archive = train(tmp_path / "changing", wall_scene(STOPS), TrainSettings(iterations=12))
     assert archive.exposure(0) is not None
-
-
-def train(
-    scene: Scene, settings: TrainSettings, folder: Path, stop_at: tuple[int, int] | None = None, resume: bool = False
-) -> RunArchive:
-    """Train a run; `stop_at` is level and iteration at which a user stops it."""
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), kind="colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    archive = RunArchive.open(folder, resume=True) if resume else RunArchive.create(folder, manifest)
-    with archive:
-        trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(stop_at))
-        trainer.run(resume)
-    return archive
-
-
-class StopAt(Monitor):
-    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
-
-    def __init__(self, place: tuple[int, int] | None) -> None:
-        self._place = place
-
-    def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == self._place:
-            signal.raise_signal(signal.SIGINT)
 
 
 def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
     settings = TrainSettings(iterations=12, exposure="on", levels=1)
-    archive = train(ring_scene(), settings, tmp_path / "run")
+    archive = train(tmp_path / "run", ring_scene(), settings)
     path = archive.path("level_0", EXPOSURE)
     path.write_text(json.dumps({"view_1.png": [[1.0, 0.0]]}))
     with pytest.raises(RunFolderError, match=r"view_colors\.json.*train again with --overwrite"):

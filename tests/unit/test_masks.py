@@ -22,7 +22,6 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import StageContext, SupervisionLoss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
-from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
@@ -31,7 +30,7 @@ from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.settings import TrainSettings
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import train
 from tests.training_scene import HEIGHT, WIDTH, ring_scene
 
 SIDE = 37
@@ -119,15 +118,11 @@ def _hiding(scene: Scene, seed: int) -> Scene:
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
 def test_what_masks_hide_changes_no_bit_of_a_run(hierarchy: str, tmp_path: Path) -> None:
     settings = TrainSettings(iterations=24, levels=2, hierarchy=hierarchy, sh_degree=0)
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap", masks="masks")
     fields, measured = [], []
     for seed in (0, 1):
-        manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-        archive = RunArchive.create(tmp_path / str(seed), manifest)
-        with archive:
-            Trainer(_hiding(ring_scene(), seed), settings, archive, CpuRasterizer()).run()
-            fields.append(archive.field(0))
-            measured.append([entry["psnr"] for entry in archive.history() if "psnr" in entry])
+        archive = train(tmp_path / str(seed), _hiding(ring_scene(), seed), settings)
+        fields.append(archive.field(0))
+        measured.append([entry["psnr"] for entry in archive.history() if "psnr" in entry])
     assert torch.equal(fields[0].means, fields[1].means)
     assert torch.equal(fields[0].sh, fields[1].sh)
     assert measured[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -22,17 +21,14 @@ from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import Hierarchy
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import world_covariances
-from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training import mcmc
 from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, shake
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import Said, ring_manifest, train
 from tests.training_scene import blob_field, ring_scene
 
 
@@ -236,18 +232,10 @@ def test_options_of_both_are_refused() -> None:
 def test_manifests_of_any_version_are_read(hierarchy: str) -> None:
     density = Densification(strategy=MCMC, options=Mcmc(cap_max=9))
     chosen = TrainSettings(hierarchy=hierarchy, densification=density)
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
+    manifest = ring_manifest(chosen)
     assert settings_from_manifest(manifest).for_manifest() == chosen.for_manifest()
     older = {name: value for name, value in manifest.settings.items() if name != "residual_resets"}
     assert settings_from_manifest(replace(manifest, settings=older)).for_manifest() == chosen.for_manifest()
-
-
-class Listening(Monitor):
-    said: ClassVar[list[str]] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
@@ -256,12 +244,9 @@ def test_runs_say_their_limits_stay_under_them_and_learn(hierarchy: str, tmp_pat
     chosen = TrainSettings(
         iterations=60, hierarchy=hierarchy, sh_degree=1, sh_every=10, split="1/2,1/2", densification=density
     )
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    with RunArchive.create(
-        tmp_path / "run", Manifest(scene=reference, rasterizer="cpu", **chosen.for_manifest())
-    ) as run:
-        Trainer(ring_scene(), chosen, run, CpuRasterizer(), monitor=Listening()).run()
-    assert "density control: --strategy mcmc, at most 110 and 120 Gaussians" in Listening.said
+    said = Said()
+    run = train(tmp_path / "run", ring_scene(), chosen, monitor=said)
+    assert "density control: --strategy mcmc, at most 110 and 120 Gaussians" in said.lines
     assert [record.num_gaussians for record in run.manifest.records] == [110, 120]
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))

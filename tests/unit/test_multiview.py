@@ -17,8 +17,6 @@ from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
-from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.multiview import (
     LATE_OPACITY,
@@ -32,7 +30,7 @@ from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Multiview
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
 EXTENT = 2.0
@@ -172,14 +170,6 @@ def test_late_pruning_waits_for_a_step() -> None:
     assert not schedule(replace(settings, densification=Densification(until=30_000))).late_prunes
 
 
-def train(path: Path, settings: TrainSettings, **options: Any) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.create(path, manifest) as archive:
-        Trainer(ring_scene(), settings, archive, CpuRasterizer(), **options).run()
-    return RunArchive.open(path)
-
-
 @pytest.mark.parametrize(
     "hierarchy", [{"levels": 1}, {"hierarchy": "laplacian", "joint": 0.5}, {"hierarchy": "nested"}]
 )
@@ -209,7 +199,7 @@ def test_runs_grow_learn_and_score_the_same_views_again(
         return found
 
     monkeypatch.setattr(FieldScoring, "scores", scores)
-    archive = train(tmp_path / "run", settings)
+    archive = train(tmp_path / "run", ring_scene(), settings)
     for record in archive.manifest.records:
         assert record.peak_gaussians > 100, "it grew"
         assert any(level == record.level for level, _ in scored)
@@ -231,7 +221,7 @@ def test_scores_of_a_residual_are_of_the_composed_image(tmp_path: Path, monkeypa
     settings = TrainSettings(iterations=40, split="39/40,1/40", hierarchy="laplacian", densification=density)
     monkeypatch.setattr(module, "view_scores", noted)
     monkeypatch.setattr(StageSchedule, "late_prunes", frozenset())
-    train(tmp_path / "run", settings)
+    train(tmp_path / "run", ring_scene(), settings)
     errors = [float(difference.abs().mean()) for difference in seen if difference.shape[-1] == 56]
     assert errors
     assert max(errors) < 0.2  # without the base it would be the image itself, 0.35 on average; worst seen 0.13

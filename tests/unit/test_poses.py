@@ -31,8 +31,8 @@ from lapgs_plugin.training.checkpoint import TransformsState, check_transforms
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
+from tests.training_runs import StopAt, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
-from tests.unit.test_exposure import train
 from tests.unit.test_views_per_step import GsplatOnCpu, kernels
 
 __all__ = ["kernels"]
@@ -141,15 +141,15 @@ def test_what_a_similarity_transform_of_the_scene_explains_is_removed() -> None:
 def test_run_refines_poses_and_resumes_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
     scene = perturbed(ring_scene(train=8, test=0), 0.02)
     settings = TrainSettings(iterations=96, hierarchy=hierarchy, sh_degree=1, refine_poses=True)
-    whole = train(scene, settings, tmp_path / "whole")
+    whole = train(tmp_path / "whole", scene, settings)
     refined_to = [whole.poses(level) for level in (1, 0)]
     assert all(each is not None and max(map(abs, each["view_0.png"])) > 0 for each in refined_to)
     assert refined_to[0] != refined_to[1]  # the base's corrections were refined further
     for stop_at in ((1, 30), (0, 45)):  # level 0 trains jointly from its iteration 36 on
         folder = tmp_path / f"stopped_{stop_at[0]}"
         with pytest.raises(TrainingStoppedError):
-            train(scene, settings, folder, stop_at)
-        again = train(scene, settings, folder, resume=True)
+            train(folder, scene, settings, monitor=StopAt(*stop_at))
+        again = resume(folder, scene, settings)
         assert [again.poses(level) for level in (1, 0)] == refined_to
         assert all((again.field(level).means == whole.field(level).means).all() for level in (0, 1))
 
@@ -163,7 +163,7 @@ def test_refinement_finds_true_poses_and_sharpens_held_out_views(
     psnr, shift = {}, {}
     for refine in (False, True):
         settings = TrainSettings(iterations=700, levels=1, sh_degree=0, gather=1, refine_poses=refine)
-        archive = train(scene, settings, tmp_path / str(refine))
+        archive = train(tmp_path / str(refine), scene, settings)
         psnr[refine], shift[refine] = archive.history()[-1]["psnr"], shift_of_points(scene, truth, archive)
     assert shift[False] == shift_of_points(scene, truth) > 1.0
     assert shift[True] < 0.5 * shift[False]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,9 @@ from torch import Tensor
 from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
-from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.exposure import ViewExposures
-from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import (
     FALL,
@@ -31,7 +26,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import Said, StopAt, resume, train
 from tests.training_scene import ring_scene
 
 
@@ -69,19 +64,9 @@ def test_samples_are_spread_and_avoid_resets() -> None:
         assert min(end for end in ends if end >= sample) % 700 != 0  # measured before the reset, not after it
 
 
-def train(
-    scene: Scene, settings: TrainSettings, folder: Path, monitor: Monitor, *hooks: StageHook, resume: bool = False
-) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), kind="colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.open(folder, resume=True) if resume else RunArchive.create(folder, manifest) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer(), user_hooks=hooks, monitor=monitor).run(resume)
-    return archive
-
-
 def test_a_run_measures_some_held_out_views_during_its_stages(tmp_path: Path) -> None:
     scene, settings = ring_scene(train=5, test=3), TrainSettings(iterations=40, sh_degree=0)
-    archive = train(scene, settings, tmp_path / "run", Monitor())
+    archive = train(tmp_path / "run", scene, settings)
     history = archive.history()
     sampled = [entry for entry in history if "sampled_psnr" in entry]
     assert [entry["iteration"] for entry in sampled] == 2 * [4, 8, 12, 16, 20]
@@ -91,31 +76,12 @@ def test_a_run_measures_some_held_out_views_during_its_stages(tmp_path: Path) ->
         assert entry["sampled_psnr"] == pytest.approx(entry["psnr"])
 
 
-class StopAt(Monitor):
-    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
-
-    def __init__(self, place: tuple[int, int]) -> None:
-        self._place = place
-
-    def tick(self, stage: Stage, tick: Tick) -> None:
-        if (tick.level, tick.iteration) == self._place:
-            signal.raise_signal(signal.SIGINT)
-
-
-class Said(Monitor):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.lines.append(text)
-
-
 def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = iter([30.0 - step for step in range(100)])
     monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: (next(values),) * 2)
     scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
     monitor = Said()
-    train(scene, settings, tmp_path / "run", monitor)
+    train(tmp_path / "run", scene, settings, monitor=monitor)
     (line,) = (said for said in monitor.lines if said != "density control: --strategy 3dgs")
     assert line.startswith("level 0, iteration ")
     assert "held-out PSNR fell to 2" in line
@@ -133,7 +99,7 @@ def test_exposures_are_read_for_measurements_alone(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(ViewExposures, "archived", read)
     settings = TrainSettings(iterations=200, levels=1, sh_degree=0, exposure="on", keep="last")
-    train(ring_scene(train=5, test=1), settings, tmp_path / "run", Said())
+    train(tmp_path / "run", ring_scene(train=5, test=1), settings)
     assert 1 <= len(reads) <= 10  # eight measurements at most, and the archive
 
 
@@ -146,7 +112,7 @@ def test_keep_best_keeps_the_last_state_unless_another_one_is_visibly_better(
     scene = ring_scene(train=12, test=0)
     settings = TrainSettings(iterations=40, levels=1, sh_degree=0, exposure="off", keep="best")
     monitor = Said()
-    train(scene, settings, tmp_path / "run", monitor)
+    train(tmp_path / "run", scene, settings, monitor=monitor)
     assert next(values, None) is None
     assert not [line for line in monitor.lines if "better than the last one" in line]
 
@@ -181,7 +147,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
 
     monkeypatch.setattr(StageEvaluation, "_psnr", invented)
     names, monitor = Names(), Said()
-    whole = train(scene, settings, tmp_path / "whole", monitor, names)
+    whole = train(tmp_path / "whole", scene, settings, monitor=monitor, user_hooks=[names])
     assert names.seen == {view.name for view in scene.train} - set(aside)
     assert (whole.field(1).means == along[0, 36]).all()
     assert (whole.field(0).means == fields[0, 36]).all()
@@ -192,8 +158,8 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     for level, iteration in ((1, 20), (0, 38)):
         folder = tmp_path / f"stopped_{level}"
         with pytest.raises(TrainingStoppedError):
-            train(scene, settings, folder, StopAt((level, iteration)))
-        again = train(scene, settings, folder, Monitor(), resume=True)
+            train(folder, scene, settings, monitor=StopAt(level, iteration))
+        again = resume(folder, scene, settings)
         assert [(again.field(each).means == whole.field(each).means).all() for each in (1, 0)] == [True, True]
         assert again.exposure(0) == exposure
 

@@ -25,7 +25,7 @@ from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
 from lapgs_plugin.scenes.sample.world import build_world
 
-SMALL = {"width": 96, "height": 64, "views": 3, "points": 40, "progress": False}
+SMALL = {"width": 48, "height": 32, "views": 3, "points": 40, "progress": False}
 WIDTH, HEIGHT = 240, 160
 VIEWS, POINTS = 10, 500
 
@@ -320,7 +320,7 @@ def test_blocks_of_an_image_miss_no_solid() -> None:
     [
         ({"views": 1}, "--views 1: expected 2 to 9999"),
         ({"points": 0}, "--points 0: expected at least 1"),
-        ({"width": 8}, "--size 8x64: expected at least 16x16"),
+        ({"width": 8}, "--size 8x32: expected at least 16x16"),
         ({"seed": -1}, "--seed -1: expected 0 or more"),
     ],
 )
@@ -375,7 +375,7 @@ def test_leftovers_of_a_killed_run_do_not_matter(tmp_path: Path) -> None:
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource", reason="Windows has no limits on file sizes")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))  # no file may grow beyond
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))  # no file may grow beyond
     try:
         with pytest.raises(LapgsError, match="check free space"):
             make_sample_scene(tmp_path / "scene", **SMALL)

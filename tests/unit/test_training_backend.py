@@ -19,7 +19,6 @@ from lapgs_plugin.errors import (
     TrainingDivergedError,
     UserInputError,
 )
-from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
@@ -28,7 +27,6 @@ from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
@@ -38,7 +36,7 @@ from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Gradients, Mcmc
-from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import plys, ring_manifest, train
 from tests.training_scene import blob_field, ring_scene
 
 SETTINGS = TrainSettings(
@@ -54,14 +52,6 @@ SETTINGS = TrainSettings(
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return ring_scene()
-
-
-def train(path: Path, scene: Scene, settings: TrainSettings, rasterizer: Rasterizer, **options: Any) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer=rasterizer.name, **settings.for_manifest())
-    with RunArchive.create(path, manifest) as archive:
-        Trainer(scene, settings, archive, rasterizer, **options).run()
-    return RunArchive.open(path)
 
 
 def losses(archive: RunArchive) -> list[tuple[int, int, float]]:
@@ -108,8 +98,7 @@ def test_options_of_gsplat_are_refused_elsewhere() -> None:
 def test_settings_survive_the_manifest_and_older_manifests_are_read(scene: Scene, tmp_path: Path) -> None:
     strategy = Densification(start=3, until=45, every=5, strategy="mcmc", options=Mcmc(cap_max=500))
     settings = replace(SETTINGS, densification=strategy, packed=True, antialiased=True)
-    reference = SceneReference("s", "full", True, (0, 0, 0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="gsplat", **settings.for_manifest())
+    manifest = ring_manifest(settings, "gsplat")
     assert settings_from_manifest(manifest).for_manifest() == settings.for_manifest()
     since = ("packed", "sparse_adam", "raster", "antialiased", "hierarchy", "base_sh_degree")
     older = {k: v for k, v in SETTINGS.for_manifest()["settings"].items() if k not in since}
@@ -160,7 +149,7 @@ def test_a_run_on_gsplat_learns_what_a_run_on_the_cpu_learns(
     theirs = train(
         tmp_path / "theirs", scene, settings, GsplatRasterizer("cpu", own_radii=True), user_hooks=[Deliver()]
     )
-    ours = train(tmp_path / "ours", scene, settings, CpuRasterizer())
+    ours = train(tmp_path / "ours", scene, settings)
     assert theirs.manifest.records[0].num_gaussians == ours.manifest.records[0].num_gaussians
     for (*place, loss), (*expected_place, expected) in zip(losses(theirs), losses(ours), strict=True):
         assert place == expected_place
@@ -174,7 +163,7 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
         density = replace(
             SETTINGS.densification, reset_every=1000, options=Gradients(grow_grad2d=2e-4, absgrad=absgrad)
         )
-        archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density), CpuRasterizer())
+        archive = train(tmp_path / f"{absgrad}", scene, replace(SETTINGS, densification=density))
         counts.append(archive.manifest.records[0].num_gaussians)
     assert counts[1] > counts[0]
 
@@ -182,18 +171,18 @@ def test_absolute_gradients_densify_more(scene: Scene, tmp_path: Path) -> None:
 def test_losses_that_are_read_together_are_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at_once = train(tmp_path / "a", scene, SETTINGS, CpuRasterizer())
+    at_once = train(tmp_path / "a", scene, SETTINGS)
     monkeypatch.setattr(StageRun, "_losses_at_once", 7)
-    later = train(tmp_path / "b", scene, SETTINGS, CpuRasterizer())
+    later = train(tmp_path / "b", scene, SETTINGS)
     assert losses(later) == losses(at_once)
-    assert all(later.field_path(level).read_bytes() == at_once.field_path(level).read_bytes() for level in (1, 0))
+    assert plys(later) == plys(at_once)
 
     class Poison(StageHook):
         def loss(self, context: StageContext, image: Tensor) -> Tensor | None:
             return image.sum() * math.nan if (context.stage.level, context.iteration) == (0, 23) else None
 
     with pytest.raises(TrainingDivergedError, match="level 0, iteration 23: the loss is nan"):
-        train(tmp_path / "c", scene, SETTINGS, CpuRasterizer(), user_hooks=[Poison()])
+        train(tmp_path / "c", scene, SETTINGS, user_hooks=[Poison()])
 
 
 def test_a_full_gpu_is_one_line(scene: Scene, tmp_path: Path) -> None:
@@ -257,7 +246,7 @@ def test_a_factor_scales_the_steps_of_higher_harmonics_alone(signed: bool) -> No
 
 def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -> None:
     settings = replace(SETTINGS, sh_degree=2, base_sh_degree=1, joint=0.5, sh_rate_factor=4.0)
-    archive = train(tmp_path / "run", scene, settings, CpuRasterizer())
+    archive = train(tmp_path / "run", scene, settings)
     assert [archive.field(level).sh_degree for level in (1, 0)] == [1, 2]
     assert all(bool((archive.field(level).sh[:, 1:] != 0).any()) for level in (1, 0))
     assert archive.history()[-1]["psnr"] > archive.history()[0].get("psnr", 0)

@@ -27,19 +27,16 @@ from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.image_store import ImageStore
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
-from lapgs_plugin.training.trainer import Trainer
-from tests.convergence.test_training import StopAt, plys
 from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
+from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
 CAMERAS = [ring_camera(angle, 40, 29) for angle in (0.2, 1.3, 2.9)]
@@ -103,14 +100,6 @@ class Batching(CpuRasterizer):
             for row, one in enumerate(each):
                 one.means2d.register_post_accumulate_grad_hook(hand_over(joined.grad[row]))
         return result
-
-
-def train(path: Path, scene: Scene, settings: TrainSettings, rasterizer: Rasterizer, **options: Any) -> RunArchive:
-    reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.create(path, manifest) as archive:
-        Trainer(scene, settings, archive, rasterizer, **options).run()
-    return RunArchive.open(path)
 
 
 @pytest.fixture(scope="module")
@@ -327,22 +316,17 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_pat
 
 def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(scene: Scene, tmp_path: Path) -> None:
     settings = replace(SETTINGS, joint=0.25, split="1/2,1/2")
-    whole = train(tmp_path / "whole", scene, settings, CpuRasterizer(), test_every=1)
+    whole = train(tmp_path / "whole", scene, settings, test_every=1)
     ends = [entry["iteration"] for entry in whole.history() if entry["level"] == 1]
     assert ends[:4] == [4, 8, 10, 14]
     for level, iteration in ((1, 8), (0, 4), (0, 27)):
         folder = tmp_path / f"{level}-{iteration}"
-        reference = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
-        manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-        with RunArchive.create(folder, manifest) as archive:
-            trainer = Trainer(scene, settings, archive, CpuRasterizer(), monitor=StopAt(level, iteration), test_every=1)
-            with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
-                trainer.run()
-        with RunArchive.open(folder, resume=True) as archive:
-            assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
-            Trainer(scene, settings, archive, CpuRasterizer(), test_every=1).run(resume=True)
-            assert plys(archive) == plys(whole)
-            assert [entry["loss"] for entry in archive.history()] == [entry["loss"] for entry in whole.history()]
+        with pytest.raises(TrainingStoppedError, match=f"level {level}, iteration {iteration}"):
+            train(folder, scene, settings, monitor=StopAt(level, iteration), test_every=1)
+        assert settings_from_manifest(RunArchive.open(folder).manifest).for_manifest() == settings.for_manifest()
+        archive = resume(folder, scene, settings, test_every=1)
+        assert plys(archive) == plys(whole)
+        assert [entry["loss"] for entry in archive.history()] == [entry["loss"] for entry in whole.history()]
 
 
 def test_two_views_a_step_learn_what_one_learns(tmp_path: Path) -> None:
@@ -351,7 +335,7 @@ def test_two_views_a_step_learn_what_one_learns(tmp_path: Path) -> None:
     found = {}
     for views in (1, 2):
         settings = replace(SETTINGS, levels=1, iterations=400, gather=1, views_per_step=str(views), densification=calm)
-        archive = train(tmp_path / str(views), scene, settings, CpuRasterizer())
+        archive = train(tmp_path / str(views), scene, settings)
         found[views] = archive.history()[-1]["loss"]
         first = archive.history()[0]["loss"]
     assert found[2] < 0.4 * first
@@ -404,25 +388,17 @@ def test_hooks_are_called_for_every_view_and_once_a_step(scene: Scene, tmp_path:
         torch.testing.assert_close(with_hook.field(0).parameters[name], value, rtol=1e-3, atol=1e-4)
 
 
-class Lines(Monitor):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.lines.append(text)
-
-
 def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_path: Path) -> None:
     """One line is shown, and the run has the same result: steps take as many views."""
     settings = replace(SETTINGS, levels=1, views_per_step="4", iterations=30)
-    lines, tight = Lines(), Batching(holds=1)
+    lines, tight = Said(), Batching(holds=1)
     found = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
     assert [count for count, _, _ in tight.asked] == [4, 2]
     strategy, *halved = lines.lines
     assert strategy == "density control: --strategy 3dgs"
     assert len(halved) == 2
     assert halved[0].startswith("level 0: no memory for 4 views at once; from here on 2 are rendered together")
-    assert plys(found) == plys(train(tmp_path / "one", scene, settings, CpuRasterizer()))
+    assert plys(found) == plys(train(tmp_path / "one", scene, settings))
 
     class Full(CpuRasterizer):
         def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -444,7 +420,7 @@ def test_views_of_several_sizes_are_rendered_by_size(tmp_path: Path) -> None:
         **{"levels": 1, "views_per_step": "6", "iterations": 24, "sh_every": 99, "prune": 0.01},
         densification=Densification(until=0),
     )
-    lines, batching = Lines(), Batching()
+    lines, batching = Said(), Batching()
     train(tmp_path / "run", mixed, settings, batching, monitor=lines)
     # Two whole epochs come before anything ends a step early.
     assert {(count, size) for count, size, _ in batching.asked[:4]} == {(4, (56, 40)), (2, (40, 56))}

@@ -12,12 +12,10 @@ import pytest
 import torch
 
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.trainer import Trainer
+from tests import training_runs
 from tests.training_scene import ring_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
@@ -42,12 +40,7 @@ def page() -> Iterator[Page]:
 def train(folder: Path, watcher: Watcher, iterations: int, hierarchy: str = "laplacian") -> RunArchive:
     calm = Densification(start=20, every=20)
     settings = TrainSettings(iterations=iterations, hierarchy=hierarchy, sh_degree=1, densification=calm)
-    scene = ring_scene()
-    reference = SceneReference(str(scene.path), "full", True, scene.background, "colmap")
-    manifest = Manifest(scene=reference, rasterizer="cpu", **settings.for_manifest())
-    with RunArchive.create(folder, manifest) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer(), watcher=watcher).run()
-    return archive
+    return training_runs.train(folder, ring_scene(), settings, watcher=watcher)
 
 
 class Watched(LiveView):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -84,7 +84,8 @@ class FieldAdam(torch.optim.Optimizer):
 
     Args:
         params: float32 or float64 tensors on the CPU.
-        lr, betas, eps: as in torch.optim.Adam, with the epsilon of 3DGS.
+        lr, eps: as in torch.optim.Adam, with the epsilon of 3DGS.
+        column_scale: as above.
 
     Raises:
         UserInputError: an argument out of range, or a parameter that is not a contiguous CPU tensor of a fitting shape.
@@ -94,41 +95,25 @@ class FieldAdam(torch.optim.Optimizer):
         self,
         params: Iterable[Tensor] | Iterable[dict[str, Any]],
         lr: float,
-        betas: tuple[float, float] = BETAS,
         eps: float = ADAM_EPS,
         column_scale: Tensor | None = None,
-        active_columns: int | None = None,
     ) -> None:
-        if lr < 0 or eps < 0 or not all(0 <= beta < 1 for beta in betas):
-            raise UserInputError(f"lr {lr}, betas {betas}, eps {eps}: expected lr and eps >= 0 and betas in [0, 1)")
-        super().__init__(
-            params,
-            {
-                "lr": lr,
-                "betas": betas,
-                "eps": eps,
-                "column_scale": column_scale,
-                "active_columns": active_columns,
-                "views": 1,
-            },
-        )
+        if lr < 0 or eps < 0:
+            raise UserInputError(f"lr {lr}, eps {eps}: expected 0 or more for both")
+        options = {"column_scale": column_scale, "active_columns": None, "views": 1}
+        super().__init__(params, {"lr": lr, "betas": BETAS, "eps": eps, **options})
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as torch's optimizers do, without importing torch's compiler, which would take a second."""
         inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # as torch's own
-        """Update every parameter that has a gradient; return the loss of `closure`, if there is one."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+    def step(self) -> None:  # type: ignore[override]  # without a closure
+        """Update every parameter that has a gradient."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
                     self._update_parameter(parameter, group)
-        return loss
 
     def _update_parameter(self, parameter: Tensor, group: dict[str, Any]) -> None:
         columns, active, scale = _rows(parameter, group["column_scale"], group["active_columns"])

@@ -13,7 +13,6 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 
 SWITCH = "LAPGS_BLEND_GRADIENTS"
 TRITON, GSPLAT = "triton", "gsplat"
-DEFAULT = TRITON
 FEWEST_PIXELS = 400_000
 """Of all images together; of fewer pixels launching our kernels takes longer than gsplat's take to run."""
 LARGEST_DIFFERENCE = 1e-3
@@ -57,7 +56,7 @@ def our_kernels_blend(means: Tensor, pixels: int) -> bool:
     Raises:
         UserInputError: the environment variable `SWITCH` has another value.
     """
-    chosen = os.environ.get(SWITCH) or DEFAULT
+    chosen = os.environ.get(SWITCH) or TRITON
     if chosen not in (TRITON, GSPLAT):
         raise UserInputError(f"{SWITCH}={chosen}: expected {TRITON} or {GSPLAT}")
     # Asked for small images too: then the render that warms up before training compiles the kernels.

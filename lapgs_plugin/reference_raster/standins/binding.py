@@ -74,15 +74,15 @@ class DcApart(Rasterizer):
 
 
 def gather(
-    means3d: Tensor,
-    means2d: Tensor,
+    means3D: Tensor,
+    means2D: Tensor,
     opacities: Tensor,
-    dc: Tensor | None,
-    shs: Tensor | None,
-    colors_precomp: Tensor | None,
-    scales: Tensor | None,
-    rotations: Tensor | None,
-    cov3d_precomp: Tensor | None,
+    dc: Tensor | None = None,
+    shs: Tensor | None = None,
+    colors_precomp: Tensor | None = None,
+    scales: Tensor | None = None,
+    rotations: Tensor | None = None,
+    cov3D_precomp: Tensor | None = None,
 ) -> Inputs:
     """Return a binding's arguments as `Inputs`, with the first SH coefficient from `dc` (n, 1, 3) if it is given.
 
@@ -92,13 +92,13 @@ def gather(
     if (shs is None) == (colors_precomp is None):
         raise UserInputError("got both or neither of shs and colors_precomp: expected exactly one of them")
     pair = (scales is not None) + (rotations is not None)
-    if pair == 1 or (pair == 2) == (cov3d_precomp is not None):
+    if pair == 1 or (pair == 2) == (cov3D_precomp is not None):
         raise UserInputError(
             "got both or neither of scales with rotations and cov3D_precomp: expected exactly one of them"
         )
     if shs is not None and dc is not None:
         shs = torch.cat([dc, shs], 1)
-    return Inputs(means3d, means2d, opacities, shs, colors_precomp, scales, rotations, cov3d_precomp)
+    return Inputs(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
 
 
 class SparseGaussianAdam(torch.optim.Adam):

@@ -32,11 +32,7 @@ from lapgs_plugin.reference_raster.layout import (
     BLOCKS,
     CENTRE_X,
     CENTRE_Y,
-    FACTOR_XX,
-    FACTOR_XY,
-    FACTOR_YY,
     LOG2_MIN_ALPHA,
-    LOG2_OPACITY,
     MAX_ALPHA,
     SLOT,
     SPLAT,
@@ -44,7 +40,7 @@ from lapgs_plugin.reference_raster.layout import (
     TILE_PIXELS,
 )
 from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
-from lapgs_plugin.reference_raster.tile_kernels import FINAL
+from lapgs_plugin.reference_raster.tile_kernels import FINAL, falloff, pixels_x, pixels_y
 
 
 @dataclass(frozen=True)
@@ -122,11 +118,9 @@ def _accumulate(
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1
-                dx = load(offsets, 2 * block * WIDTH) + tile_x * TILE - broadcast(splats, s + CENTRE_X)
-                dy = load(offsets, (2 * block + 1) * WIDTH) + tile_y * TILE - broadcast(splats, s + CENTRE_Y)
-                u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
-                v = dy * broadcast(splats, s + FACTOR_YY)
-                exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+                dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
+                dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
+                _, _, exponent = falloff(splats, s, dx, dy)
                 alpha = minimum(exp2(exponent), MAX_ALPHA)
                 last = load(final, tile * FINAL + (2 * block + 1) * WIDTH)
                 blended = (exponent >= LOG2_MIN_ALPHA) & (last >= position)

@@ -36,26 +36,16 @@ FOCAL_TOLERANCE = 1e-3
 class Settings(Protocol):
     """Declare the fields that all `GaussianRasterizationSettings` share, named as in the CUDA bindings."""
 
-    @property
-    def image_height(self) -> int: ...
-    @property
-    def image_width(self) -> int: ...
-    @property
-    def tanfovx(self) -> float: ...
-    @property
-    def tanfovy(self) -> float: ...
-    @property
-    def bg(self) -> Tensor: ...
-    @property
-    def scale_modifier(self) -> float: ...
-    @property
-    def viewmatrix(self) -> Tensor: ...
-    @property
-    def projmatrix(self) -> Tensor: ...
-    @property
-    def sh_degree(self) -> int: ...
-    @property
-    def campos(self) -> Tensor: ...
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
 
 
 class Inputs(NamedTuple):
@@ -142,13 +132,9 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     call = _Call(
         settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     )
-    image, inverse_depths, radii = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
-    assert call.centres is not None
-    assert call.depths is not None
-    return Output(
-        image, radii, inverse_depths if options.inverse_depth else None, call.centres, call.depths, call.contributions,
-        call.blending,
-    )  # fmt: skip
+    image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
+    inverse_depths = inverse_depths if options.inverse_depth else None
+    return Output(image, radii, inverse_depths, centres, depths, call.contributions, call.blending)
 
 
 def view_of(settings: Settings) -> View:
@@ -180,13 +166,11 @@ def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
 
 
 class _Call:
-    """Hold the arguments of a call that are no tensors, and its results that are not differentiable."""
+    """Hold the arguments of a call that are no tensors, and its results that are none."""
 
     def __init__(self, settings: Settings, view: View, options: Options, keep: bool) -> None:
         self.settings, self.view, self.options, self.keep = settings, view, options, keep
         self.background = settings.bg.detach().to("cpu", torch.float32).contiguous().numpy()
-        self.centres: Tensor | None = None
-        self.depths: Tensor | None = None
         self.contributions: Contributions | None = None
         self.blending: Blending | None = None
 
@@ -224,22 +208,22 @@ class _Call:
 
 
 class _Rasterize(torch.autograd.Function):
-    """Map (call, *tensors of Inputs) to image, inverse depths (empty if not asked for), radii."""
+    """Map (call, *tensors of Inputs) to image, inverse depths (empty if not asked for), radii, centres, depths."""
 
     @staticmethod
-    def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         gaussians = call.gaussians(tensors)
         weights = call.options.pixel_weights
         n = len(gaussians.means)
         keep = call.keep or weights is not None or call.options.blending
         rendering = call.render(gaussians, call.background, keep)
-        image, radii, call.centres = (
+        image, radii, centres = (
             torch.from_numpy(array) for array in (rendering.image, rendering.radii, rendering.centres)
         )
         if n == 0:
             image = torch.zeros_like(image)
         depths = depths_of(torch.from_numpy(gaussians.means), call.settings.viewmatrix)
-        call.depths = torch.where(radii > 0, depths, 0.0)
+        depths = torch.where(radii > 0, depths, 0.0)
         if weights is not None:
             assert rendering.kept is not None
             flat = weights.detach().to("cpu", torch.float32).contiguous().reshape(-1).numpy()
@@ -254,16 +238,15 @@ class _Rasterize(torch.autograd.Function):
             ctx.call, ctx.rendering = call, rendering
             ctx.save_for_backward(*tensors)
             ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
-        return image, inverse_depths, radii
+        ctx.mark_non_differentiable(radii, centres, depths)
+        return image, inverse_depths, radii, centres, depths
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_image: Tensor | None, grad_depth: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
         tensors = Inputs._make(ctx.saved_tensors)
         total: list[Tensor | None] = [None] * len(tensors)
-        grad_image, grad_depth = from_above[0], from_above[1]
         if grad_image is not None:
             total = _add(total, _gradients(call, tensors, call.gaussians(tensors), ctx.rendering, grad_image))
         if grad_depth is not None and call.options.inverse_depth:

@@ -78,8 +78,7 @@ class MiniSplatting(WholeSh):
 
         `accum_alpha` (1, h, w) is the transmittance behind all Gaussians, as in the CUDA code.
         """
-        arguments = ("dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
-        inputs = gather(means3D, means2D, opacities, *(more.get(name) for name in arguments))
+        inputs = gather(means3D, means2D, opacities, **more)
         return _depths_of_leaders(self.raster_settings, inputs)
 
 
@@ -110,9 +109,7 @@ class MiniSplatting2(MiniSplatting):
         self, means3D: Tensor, means2D: Tensor, opacities: Tensor, culling: Tensor, **more: Tensor | None
     ) -> tuple[Tensor, ...]:
         """Return what Mini-Splatting's `forward` returns."""
-        arguments = ("dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
-        opacities = torch.where(culling[:, None], 0.0, opacities)
-        inputs = gather(means3D, means2D, opacities, *(more.get(name) for name in arguments))
+        inputs = gather(means3D, means2D, torch.where(culling[:, None], 0.0, opacities), **more)
         settings = self.raster_settings
         return with_shares(settings, rasterize(settings, inputs, summing(settings, blending=True)))
 

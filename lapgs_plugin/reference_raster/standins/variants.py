@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -139,23 +139,21 @@ def _weight_rows(settings: Any) -> int:
     return 0 if settings.pixel_weights is None else len(settings.pixel_weights)
 
 
+_ANTIALIASED = Variant(
+    "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
+    (*_FAMILY, "antialiasing"),
+    options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
+    outputs=_with_inverse_depths,
+    returned=3,
+)
 BACKBONES = {
     "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main.", returned=2),
-    "graphdeco-aa": Variant(
-        "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
-        (*_FAMILY, "antialiasing"),
-        options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
-        outputs=_with_inverse_depths,
-        returned=3,
-    ),
+    "graphdeco-aa": _ANTIALIASED,
     # Two faults of the copies in circulation are left out: their backward pass counts a background that is not black
     # twice, and skips Gaussians at random after a reduction over the wrong number of threads.
-    "graphdeco-accel": Variant(
-        "Stand in for graphdeco's accelerated rasterizer: as branch dr_aa, with DC apart and sparse Adam.",
-        (*_FAMILY, "antialiasing"),
-        options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
-        outputs=_with_inverse_depths,
-        returned=3,
+    "graphdeco-accel": replace(
+        _ANTIALIASED,
+        description="Stand in for graphdeco's accelerated rasterizer: as branch dr_aa, with DC apart and sparse Adam.",
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
@@ -190,27 +188,25 @@ BACKBONES = {
 }
 """By name, as `BackboneInfo.stand_in` gives it; most are also names of recipes in patches/."""
 
+_MINI_SPLATTING = Variant(
+    "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
+    options=partial(forks.summing, blending=True),
+    outputs=forks.with_shares,
+    module="diff_gaussian_rasterization_ms",
+    binding=forks.MiniSplatting,
+    beside=("graphdeco",),
+)
 FORKS = {
     "speedy-splat": Variant(
         "Stand in for the rasterizer of Speedy-Splat: with the scores that it prunes by.", binding=forks.SpeedySplat
     ),
-    "mini-splatting": Variant(
-        "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
-        options=partial(forks.summing, blending=True),
-        outputs=forks.with_shares,
-        module="diff_gaussian_rasterization_ms",
-        binding=forks.MiniSplatting,
-        beside=("graphdeco",),
-    ),
-    "mini-splatting2": Variant(
-        "Stand in for the rasterizer of Mini-Splatting2: as Mini-Splatting's, with culling.",
-        options=partial(forks.summing, blending=True),
-        outputs=forks.with_shares,
-        module="diff_gaussian_rasterization_ms",
+    "mini-splatting": _MINI_SPLATTING,
+    "mini-splatting2": replace(
+        _MINI_SPLATTING,
+        description="Stand in for the rasterizer of Mini-Splatting2: as Mini-Splatting's, with culling.",
+        binding=forks.MiniSplatting2,
         sparse_adam=True,
         fused_ssim=True,
-        binding=forks.MiniSplatting2,
-        beside=("graphdeco",),
     ),
     "3dgs-mcmc": Variant(
         "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",

@@ -1,0 +1,71 @@
+"""Runs of the built-in trainer in a test: start, resume, stop and listen to them."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+
+RING = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
+"""What manifests say of `ring_scene`."""
+
+
+def ring_manifest(settings: TrainSettings, rasterizer: str = "cpu", scene: SceneReference = RING) -> Manifest:
+    return Manifest(scene=scene, rasterizer=rasterizer, **settings.for_manifest())
+
+
+def make_archive(path: Path, settings: TrainSettings, rasterizer: str = "cpu") -> RunArchive:
+    return RunArchive.create(path, ring_manifest(settings, rasterizer))
+
+
+def train(
+    path: Path, scene: Scene, settings: TrainSettings, rasterizer: Rasterizer | None = None, **options: Any
+) -> RunArchive:
+    """Train a new run; `options` are those of `Trainer`."""
+    rasterizer = CpuRasterizer() if rasterizer is None else rasterizer
+    with make_archive(path, settings, rasterizer.name) as archive:
+        Trainer(scene, settings, archive, rasterizer, **options).run()
+    return RunArchive.open(path)
+
+
+def resume(path: Path, scene: Scene, settings: TrainSettings, **options: Any) -> RunArchive:
+    """Train a stopped run to its end."""
+    with RunArchive.open(path, resume=True) as archive:
+        Trainer(scene, settings, archive, CpuRasterizer(), **options).run(resume=True)
+    return RunArchive.open(path)
+
+
+def plys(archive: RunArchive) -> list[bytes]:
+    """The fields' files, coarsest level first."""
+    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+
+
+class StopAt(Monitor):
+    """Stop the run, as Ctrl-C does, when a level reaches an iteration."""
+
+    def __init__(self, level: int, iteration: int) -> None:
+        self._place = (level, iteration)
+
+    def tick(self, stage: Stage, tick: Tick) -> None:
+        if (tick.level, tick.iteration) == self._place:
+            signal.raise_signal(signal.SIGINT)
+
+
+class Said(Monitor):
+    """Keep the lines that a run says."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
