@@ -25,5 +25,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _seeded() -> None:
+def _seeded_and_in_one_thread() -> None:
+    """On tensors this small, a second thread of PyTorch only spins."""
     torch.manual_seed(0)
+    torch.set_num_threads(1)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -268,3 +269,13 @@ def direct_on_cpu(finishing: Any = Finishing) -> Iterator[None]:
         patch.setattr(torch.cuda, "device", lambda device: nullcontext())
         patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", finishing)
         yield
+
+
+class GsplatOnCpu(GsplatRasterizer):
+    """Call gsplat's functions or, `direct`, its kernels."""
+
+    can_batch = True
+
+    def __init__(self, direct: bool, **options: Any) -> None:
+        super().__init__("cpu", **options)
+        self._may_be_direct = self._must_be_direct = direct

@@ -13,6 +13,7 @@ import copy
 import inspect
 import logging
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -197,7 +198,7 @@ class BackboneAdapter:
         """Compute an LPIPS if reports will: the first one downloads networks, and would do so hours into training."""
         import torch
 
-        due = [i for i in call.values.get("testing_iterations") or () if 0 < i <= call.opt.iterations]
+        due = [i for i in call.test_iterations if 0 < i <= call.opt.iterations]
         lpips = getattr(self.train, "lpips", None)
         if not due or not inspect.isfunction(lpips):  # a module of that name has classes of its own
             return
@@ -228,12 +229,18 @@ class BackboneAdapter:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
         copies = {role: copy.copy(call.values[name]) for role, name in call.roles.items()}
         dataset, opt, pipe = copies["dataset"], copies["opt"], copies.get("pipe", SimpleNamespace())
+        parsed = {name: copy.copy(value) for name, value in call.values.items() if isinstance(value, Namespace)}
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
         for name in ("densify_until_iter", "position_lr_max_steps"):
             if hasattr(opt, name):
                 setattr(opt, name, window.scaled(getattr(opt, name)))
         for name in self.densify_thresholds(opt):
+            if not hasattr(opt, name):
+                raise UserInputError(
+                    f"--backbone {self.info.name}: the script has no option {name}, which densify_thresholds names; "
+                    "correct the adapter, or choose another with --backbone"
+                )
             setattr(opt, name, getattr(opt, name) * window.threshold_factor)
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
@@ -241,16 +248,16 @@ class BackboneAdapter:
             # The checkout's own conversion of SH in Python has no signed colour.
             pipe.convert_SHs_python = False
             # A residual's opacity says where detail is missing, not where surfaces are.
-            for name in _options(opt, "depth", "weight"):
-                setattr(opt, name, 0.0)
+            for options in (opt, *parsed.values()):
+                for name in _options(options, "depth", "weight"):
+                    setattr(options, name, 0.0)
             for name in _options(opt, "feature", "_lr"):
                 setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
-        values: dict[str, Any] = {**copies, **dict.fromkeys(CHECKPOINTS)}
-        values |= {name: window.local(iterations) for name, iterations in call.iteration_lists.items()}
+        values: dict[str, Any] = {**parsed, **copies, **dict.fromkeys(CHECKPOINTS)}
         debug_from = call.values.get("debug_from", -1)
         pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
-        return call.changed(**values)
+        return call.changed(**values).listing(window.local)
 
     def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         """Return the symbols to replace besides those that the runner replaces in every backbone.

@@ -11,6 +11,7 @@ from pathlib import Path
 from lapgs_plugin import adapters
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.generic import Adapter as GenericAdapter
+from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.registry import Registry
@@ -47,6 +48,11 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
     """
     found = {name: BACKBONES[name] for name in BACKBONES}
     for name, adapter in found.items():
+        if not isinstance(getattr(adapter, "info", None), BackboneInfo):
+            raise UserInputError(
+                f"--backbone {name}: {adapter.__module__}.{adapter.__qualname__} has no BackboneInfo called info; fix "
+                "or uninstall the package that brings it"
+            )
         if adapter.info.name != name:
             raise UserInputError(
                 f"--backbone {name}: the info of {adapter.__module__}.{adapter.__qualname__} has the name "

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import inspect
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -87,19 +88,27 @@ class TrainingCall:
     @property
     def checkpoint(self) -> Any:
         """Checkpoint to start from, if the script takes one."""
-        return next((self.values[name] for name in CHECKPOINTS if name in self.values), None)
+        return next((given[name] for given in self._named for name in CHECKPOINTS if name in given), None)
+
+    @property
+    def test_iterations(self) -> Sequence[int]:
+        """Iterations after which the script measures its views."""
+        lists = (each for given in self._named for each in _iteration_lists(given))
+        return next((iterations for name, iterations in lists if name.startswith("test")), ())
 
     @property
     def iteration_lists(self) -> dict[str, Sequence[int]]:
         """Arguments that list iterations, such as those to save after."""
-        given = self.values.items()
-        return {
-            name: value for name, value in given if name.endswith("iterations") and isinstance(value, (list, tuple))
-        }
+        return dict(_iteration_lists(self.values))
 
     @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
+
+    @property
+    def _named(self) -> list[Mapping[str, Any]]:
+        """Arguments by name; then the script's parsed options, where they are one of them."""
+        return [self.values, *(vars(value) for value in self.values.values() if isinstance(value, Namespace))]
 
     def changed(self, **values: Any) -> TrainingCall:
         """Return the call with other values of some arguments, by role or parameter; absent ones are left out."""
@@ -107,10 +116,24 @@ class TrainingCall:
         known = {name: value for name, value in named.items() if name in self.values}
         return replace(self, values={**self.values, **known})
 
-    def run(self) -> None:
-        """Make the call, during which all of the script's parsed options name this call's output folder.
+    def listing(self, change: Callable[[Sequence[int]], list[int]]) -> TrainingCall:
+        """Return the call with other lists of iterations: arguments, and parsed options among the arguments."""
+        lists: dict[str, Any] = {name: change(iterations) for name, iterations in self.iteration_lists.items()}
+        for name, value in self.values.items():
+            if isinstance(value, Namespace):
+                lists[name] = Namespace(**{**vars(value), **{n: change(i) for n, i in _iteration_lists(vars(value))}})
+        return replace(self, values={**self.values, **lists})
 
-        Some forks write into the folder of the options in a global variable.
+    def run(self) -> None:
+        """Make the call."""
+        with self.own_folder():
+            self.function(**self.values)
+
+    @contextmanager
+    def own_folder(self) -> Iterator[None]:
+        """Let all of the script's parsed options name this call's output folder, as its `dataset` does.
+
+        Some forks read the folder from a global variable, or give all options to their scene.
         """
         variables = getattr(inspect.unwrap(self.function), "__globals__", {})
         parsed = [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
@@ -119,10 +142,15 @@ class TrainingCall:
         try:
             for each, _ in kept:
                 each.model_path = folder
-            self.function(**self.values)
+            yield
         finally:
             for each, before in reversed(kept):
                 each.model_path = before
+
+
+def _iteration_lists(values: Mapping[str, Any]) -> list[tuple[str, Sequence[int]]]:
+    """Return the values that list iterations, with their names."""
+    return [(n, value) for n, value in values.items() if n.endswith("iterations") and isinstance(value, (list, tuple))]
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,7 @@ def examine() -> dict[str, list[Finding]]:
             requirements[""], {name: probe.result() for name, probe in imports.items()}
         ),
         "Extras": findings.extra_findings(requirements),
+        "Entry points of other packages": findings.entry_point_findings(),
         "Backbones": [
             findings.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
             *(extension.result() for extension in extensions),

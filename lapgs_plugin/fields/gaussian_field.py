@@ -67,6 +67,7 @@ class GaussianField:
 
     @property
     def sh_degree(self) -> int:
+        """Highest degree of `sh`, 0 to 3."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     @property
@@ -79,9 +80,11 @@ class GaussianField:
         return GaussianField(**{**self.parameters, **parameters}, signed=self.signed)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> GaussianField:
+        """Return the field on another device or in another precision, with gradients to this one."""
         return self.with_parameters({k: v.to(device=device, dtype=dtype) for k, v in self.parameters.items()})
 
     def detach(self) -> GaussianField:
+        """Return the field without gradients; it shares memory with this one."""
         return self.with_parameters({k: v.detach() for k, v in self.parameters.items()})
 
     def require_finite(self) -> None:

@@ -133,10 +133,12 @@ class StagePlan:
 
     @property
     def levels(self) -> int:
+        """Number of levels L, one for each stage."""
         return len(self.stages)
 
     @property
     def iterations(self) -> int:
+        """Iterations of all stages together."""
         return sum(stage.iterations for stage in self.stages)
 
     def iterations_before(self, level: int) -> int:

@@ -2,8 +2,9 @@
 
 - Vectors (`lanes`; `lowering` teaches them to Numba by `numba.extending`). LLVM vectorises the loops that it fully
   understands and silently leaves the others scalar: blending, with its early exits and its skipped blocks, is one of
-  them. Numba's `@vectorize` would write every intermediate value of a pixel to memory. `lanes` also reads arrays
-  without reference counts, which Numba counts atomically, and has the atomic counter that threads take tasks from.
+  them. Numba's `@vectorize` makes functions of whole arrays, so that all pixels would go through memory for each splat.
+  `lanes` also reads arrays without reference counts, which Numba counts atomically, and has the atomic counter that
+  threads take tasks from.
 - Threads (`threads`). `prange` deals out equal numbers of tiles, of which some take many times as long as others. Its
   thread pools end the process if two Python threads use them at once (workqueue) or if it has been forked (GNU OpenMP),
   or are another package (TBB). `concurrent.futures` takes longer to start a kernel on many threads than a small

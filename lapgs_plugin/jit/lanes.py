@@ -57,7 +57,8 @@ def _compiled_only() -> NoReturn:
 
 
 def borrowed(array: _Array) -> _Array:
-    """Return the array as a bare pointer for the functions of this module: no bounds, indexing or reference count.
+    """Return the array as a bare pointer, for the functions of this module and for indexing: no bounds, no reference
+    count, no negative indices.
 
     Numba counts references atomically. In an inner loop this can cost more than the arithmetic, most of all when
     several threads count references to the same array. Arguments of a kernel outlive it; an array that a kernel makes
@@ -73,21 +74,6 @@ def keep_alive(array: NDArray[Any]) -> None:
 
 def load(array: Floats, start: int) -> Lanes:
     """Load array[start : start + 16] of a contiguous array."""
-    _compiled_only()
-
-
-def broadcast(array: Floats, index: int) -> Lanes:
-    """Load array[index] into each lane."""
-    _compiled_only()
-
-
-def at(array: NDArray[Any], index: int) -> Any:
-    """Return array[index]; integers are widened to 64 bits."""
-    _compiled_only()
-
-
-def put(array: NDArray[Any], index: int, value: Any) -> None:
-    """Set array[index] = value."""
     _compiled_only()
 
 

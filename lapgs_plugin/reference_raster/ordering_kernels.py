@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_plugin.jit.compiler import inline, jit
-from lapgs_plugin.jit.lanes import at, fetch_add, prefetch
+from lapgs_plugin.jit.lanes import borrowed, fetch_add, prefetch
 
 DIGIT_BITS = 11
 """Bits that one round of the radix sort sorts by."""
@@ -21,10 +21,7 @@ AHEAD = 16
 @inline
 def _box(boxes: NDArray[np.int32], i: int) -> tuple[int, int, int, int]:
     """Return the first tile across and down, and one past the last across and down."""
-    return (
-        at(boxes, 4 * i), at(boxes, 4 * i + 1),
-        at(boxes, 4 * i + 2), at(boxes, 4 * i + 3),
-    )  # fmt: skip
+    return boxes[4 * i], boxes[4 * i + 1], boxes[4 * i + 2], boxes[4 * i + 3]
 
 
 @jit
@@ -38,7 +35,7 @@ def count_pairs(n: int, boxes: NDArray[np.int32], first_pair: NDArray[np.int64])
     Returns:
         The number of splats that cover a tile.
     """
-    total, shown = 0, 0
+    total, shown, boxes = 0, 0, borrowed(boxes)
     for i in range(n):
         first_pair[i] = total
         left, top, right, bottom = _box(boxes, i)
@@ -100,15 +97,15 @@ def count_tiles(
     counts: NDArray[np.int64],  # (chunks, tiles) zero
 ) -> None:
     """Count the splats of each chunk of the order that cover each tile."""
-    chunks = counts.shape[0]
+    chunks, shown, order, boxes = counts.shape[0], order.size, borrowed(order), borrowed(boxes)
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= chunks:
             break
         row = counts[chunk]
-        for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
-            prefetch(boxes, 4 * at(order, min(rank + AHEAD, order.size - 1)))
-            left, top, right, bottom = _box(boxes, at(order, rank))
+        for rank in range(shown * chunk // chunks, shown * (chunk + 1) // chunks):
+            prefetch(boxes, 4 * order[min(rank + AHEAD, shown - 1)])
+            left, top, right, bottom = _box(boxes, order[rank])
             for y in range(top, bottom):
                 for x in range(left, right):
                     row[y * tiles_x + x] += 1
@@ -144,18 +141,19 @@ def list_by_tile(
     places: NDArray[np.int32],  # (pairs,) filled: where in `members` each splat's pairs are, splat after splat
 ) -> None:
     """Sort the pairs by tile: a stable counting sort."""
-    chunks = starts.shape[0]
+    chunks, shown, order, boxes = starts.shape[0], order.size, borrowed(order), borrowed(boxes)
+    first_pair = borrowed(first_pair)
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= chunks:
             break
         row = starts[chunk]
-        for rank in range(order.size * chunk // chunks, order.size * (chunk + 1) // chunks):
-            coming = at(order, min(rank + AHEAD, order.size - 1))
+        for rank in range(shown * chunk // chunks, shown * (chunk + 1) // chunks):
+            coming = order[min(rank + AHEAD, shown - 1)]
             prefetch(boxes, 4 * coming)
             prefetch(first_pair, coming)
-            i = at(order, rank)
-            pair = at(first_pair, i)
+            i = order[rank]
+            pair = first_pair[i]
             left, top, right, bottom = _box(boxes, i)
             for y in range(top, bottom):
                 for x in range(left, right):

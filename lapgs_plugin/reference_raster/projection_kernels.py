@@ -24,7 +24,6 @@ from lapgs_plugin.jit.lanes import (
     Mask,
     absolute,
     any_lane,
-    at,
     borrowed,
     ceil,
     exp,
@@ -39,7 +38,6 @@ from lapgs_plugin.jit.lanes import (
     maximum,
     minimum,
     prefetch,
-    put,
     select,
     splat,
     sqrt,
@@ -119,7 +117,7 @@ def _rows(array: Floats, first: int, n: int, columns: int, spare: Floats) -> tup
     if first + WIDTH <= n:
         return array, start
     for i in range(WIDTH * columns):
-        put(spare, i, at(array, start + i) if start + i < n * columns else 0.0)
+        spare[i] = array[start + i] if start + i < n * columns else 0.0
     return spare, 0
 
 
@@ -208,7 +206,7 @@ def _clamped(value: Lanes, limit: float) -> Lanes:
 def _rotate(camera: Floats, row: int, vector: Lanes3) -> Lanes:
     """Multiply a row of the camera's rotation by a vector."""
     i = ROTATION + 3 * row
-    return fma(vector[0], at(camera, i), fma(vector[1], at(camera, i + 1), vector[2] * at(camera, i + 2)))
+    return fma(vector[0], camera[i], fma(vector[1], camera[i + 1], vector[2] * camera[i + 2]))
 
 
 @inline
@@ -217,19 +215,19 @@ def _rotate_back(camera: Floats, vector: Lanes3) -> Lanes3:
     x, y, z = vector
     r = ROTATION
     return (
-        fma(x, at(camera, r), fma(y, at(camera, r + 3), z * at(camera, r + 6))),
-        fma(x, at(camera, r + 1), fma(y, at(camera, r + 4), z * at(camera, r + 7))),
-        fma(x, at(camera, r + 2), fma(y, at(camera, r + 5), z * at(camera, r + 8))),
+        fma(x, camera[r], fma(y, camera[r + 3], z * camera[r + 6])),
+        fma(x, camera[r + 1], fma(y, camera[r + 4], z * camera[r + 7])),
+        fma(x, camera[r + 2], fma(y, camera[r + 5], z * camera[r + 8])),
     )
 
 
 @inline
 def _in_view(camera: Floats, mean: Lanes3) -> Lanes3:
     """Return x / z, y / z and z of a point in camera coordinates."""
-    depth = _rotate(camera, 2, mean) + at(camera, TRANSLATION + 2)
+    depth = _rotate(camera, 2, mean) + camera[TRANSLATION + 2]
     inverse = 1.0 / depth
-    x = (_rotate(camera, 0, mean) + at(camera, TRANSLATION)) * inverse
-    y = (_rotate(camera, 1, mean) + at(camera, TRANSLATION + 1)) * inverse
+    x = (_rotate(camera, 0, mean) + camera[TRANSLATION]) * inverse
+    y = (_rotate(camera, 1, mean) + camera[TRANSLATION + 1]) * inverse
     return x, y, depth
 
 
@@ -243,14 +241,14 @@ def _screen_rows(camera: Floats, x_scale: Lanes, y_scale: Lanes, x: Lanes, y: La
     """
     r = ROTATION
     x_row = (
-        x_scale * (at(camera, r) - x * at(camera, r + 6)),
-        x_scale * (at(camera, r + 1) - x * at(camera, r + 7)),
-        x_scale * (at(camera, r + 2) - x * at(camera, r + 8)),
+        x_scale * (camera[r] - x * camera[r + 6]),
+        x_scale * (camera[r + 1] - x * camera[r + 7]),
+        x_scale * (camera[r + 2] - x * camera[r + 8]),
     )
     y_row = (
-        y_scale * (at(camera, r + 3) - y * at(camera, r + 6)),
-        y_scale * (at(camera, r + 4) - y * at(camera, r + 7)),
-        y_scale * (at(camera, r + 5) - y * at(camera, r + 8)),
+        y_scale * (camera[r + 3] - y * camera[r + 6]),
+        y_scale * (camera[r + 4] - y * camera[r + 7]),
+        y_scale * (camera[r + 5] - y * camera[r + 8]),
     )
     return x_row, y_row
 
@@ -269,9 +267,9 @@ def _axes(q: Lanes4) -> tuple[Lanes3, Lanes3, Lanes3]:
 @inline
 def _direction(camera: Floats, mean: Lanes3) -> tuple[Lanes3, Lanes]:
     """Return the unit vector from the camera to the centre, and one over the distance."""
-    x = mean[0] - at(camera, POSITION)
-    y = mean[1] - at(camera, POSITION + 1)
-    z = mean[2] - at(camera, POSITION + 2)
+    x = mean[0] - camera[POSITION]
+    y = mean[1] - camera[POSITION + 1]
+    z = mean[2] - camera[POSITION + 2]
     inverse = 1.0 / sqrt(fma(x, x, fma(y, y, z * z)))
     return (x * inverse, y * inverse, z * inverse), inverse
 
@@ -318,15 +316,15 @@ def project(
         if not any_lane(in_front):
             _store_unseen(first, splats, boxes, radii, centres)
             continue
-        centre_x = fma(x, at(camera, FOCAL_X), at(camera, PRINCIPAL_X) - 0.5)
-        centre_y = fma(y, at(camera, FOCAL_Y), at(camera, PRINCIPAL_Y) - 0.5)
+        centre_x = fma(x, camera[FOCAL_X], camera[PRINCIPAL_X] - 0.5)
+        centre_y = fma(y, camera[FOCAL_Y], camera[PRINCIPAL_Y] - 0.5)
 
         quat = _columns4(quats, first, n, spare)
         if raw:
             quat = _unit(quat, _length(quat))
         scale = _scale(scales, first, n, raw, spare)
-        x_scale, y_scale = at(camera, FOCAL_X) / depth, at(camera, FOCAL_Y) / depth
-        near_x, near_y = _clamped(x, at(camera, LIMIT_X)), _clamped(y, at(camera, LIMIT_Y))
+        x_scale, y_scale = camera[FOCAL_X] / depth, camera[FOCAL_Y] / depth
+        near_x, near_y = _clamped(x, camera[LIMIT_X]), _clamped(y, camera[LIMIT_Y])
         x_row, y_row = _screen_rows(camera, x_scale, y_scale, near_x, near_y)
         axes = _axes(quat)
         m_x, m_y = _each(_times(x_row, axes), scale), _each(_times(y_row, axes), scale)
@@ -540,13 +538,13 @@ def _sum_slots(
     """Add up the slots of 16 Gaussians, tile by tile; `pairs` gets the number of slots of each."""
     for lane in range(WIDTH):
         total = splat(slots, 0.0)
-        put(pairs, lane, 0.0)
+        pairs[lane] = 0.0
         if first + lane < n:
-            start, end = at(first_pair, first + lane), at(first_pair, first + lane + 1)
-            put(pairs, lane, end - start)
+            start, end = first_pair[first + lane], first_pair[first + lane + 1]
+            pairs[lane] = end - start
             for place in range(start, end):
-                prefetch(slots, at(places, min(place + AHEAD, last_place)) * SLOT)
-                total = total + load(slots, at(places, place) * SLOT)
+                prefetch(slots, places[min(place + AHEAD, last_place)] * SLOT)
+                total = total + load(slots, places[place] * SLOT)
         store(sums, lane * SLOT, total)
 
 
@@ -582,8 +580,8 @@ def _shape_backward(
         d_centre_x, d_centre_y: gradient by the centre on the image.
     """
     x, y, depth = _in_view(camera, mean)
-    x_scale, y_scale = at(camera, FOCAL_X) / depth, at(camera, FOCAL_Y) / depth
-    near_x, near_y = _clamped(x, at(camera, LIMIT_X)), _clamped(y, at(camera, LIMIT_Y))
+    x_scale, y_scale = camera[FOCAL_X] / depth, camera[FOCAL_Y] / depth
+    near_x, near_y = _clamped(x, camera[LIMIT_X]), _clamped(y, camera[LIMIT_Y])
     x_row, y_row = _screen_rows(camera, x_scale, y_scale, near_x, near_y)
     axes = _axes(quat)
     n_x, n_y = _times(x_row, axes), _times(y_row, axes)  # J W R
@@ -666,7 +664,7 @@ def _axis_backward(
         d_centre: gradient by the centre on the image.
     """
     across, along = _rotate(camera, axis, d_row) * x_scale, _rotate(camera, 2, d_row) * x_scale
-    free = select(absolute(x) > at(camera, LIMIT_X + axis), 0.0, along)
+    free = select(absolute(x) > camera[LIMIT_X + axis], 0.0, along)
     by_coordinate = fma(d_centre, x_scale, -(free / depth))
     by_depth = fma(2.0 * near_x, along, -across) / depth - d_centre * x_scale * x
     return by_coordinate, by_depth

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from lapgs_plugin.jit.compiler import inline
-from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, Lanes3, Mask, at, fma, load_rows, put, select, store_rows
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, Lanes3, Mask, fma, load_rows, select, store_rows
 
 COLUMNS = 48
 """Coefficients of degree 3, three channels each."""
@@ -39,7 +39,7 @@ def sh_rows(sh: Floats, first: int, n: int, columns: int, spare: Floats) -> tupl
     for lane in range(WIDTH):
         for i in range(COLUMNS):
             known = first + lane < n and i < columns
-            put(spare, lane * COLUMNS + i, at(sh, (first + lane) * columns + i) if known else 0.0)
+            spare[lane * COLUMNS + i] = sh[(first + lane) * columns + i] if known else 0.0
     return spare, 0
 
 
@@ -207,4 +207,4 @@ def store_sh_gradient(
     if columns != COLUMNS:
         for lane in range(WIDTH):
             for i in range(columns):
-                put(grad_sh, (first + lane) * columns + i, at(spare, lane * COLUMNS + i))
+                grad_sh[(first + lane) * columns + i] = spare[lane * COLUMNS + i]

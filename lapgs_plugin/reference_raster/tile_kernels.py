@@ -23,10 +23,8 @@ from lapgs_plugin.jit.lanes import (
     Lanes,
     absolute,
     any_lane,
-    at,
     bits,
     borrowed,
-    broadcast,
     exp2,
     fetch_add,
     fma,
@@ -36,7 +34,6 @@ from lapgs_plugin.jit.lanes import (
     maximum,
     minimum,
     prefetch,
-    put,
     select,
     splat,
     store,
@@ -121,13 +118,13 @@ def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
     Args:
         left, top: pixel coordinates of the blocks' first pixels.
     """
-    x0, y0 = left - broadcast(splats, s + CENTRE_X), top - broadcast(splats, s + CENTRE_Y)
+    x0, y0 = left - splats[s + CENTRE_X], top - splats[s + CENTRE_Y]
     x1, y1 = x0 + (BLOCK - 1.0), y0 + (BLOCK - 1.0)
     near_x, near_y = minimum(maximum(x0, 0.0), x1), minimum(maximum(y0, 0.0), y1)
-    best_x = minimum(maximum(near_y * broadcast(splats, s + RIDGE_X), x0), x1)
-    best_y = minimum(maximum(near_x * broadcast(splats, s + RIDGE_Y), y0), y1)
+    best_x = minimum(maximum(near_y * splats[s + RIDGE_X], x0), x1)
+    best_y = minimum(maximum(near_x * splats[s + RIDGE_Y], y0), y1)
     least = minimum(_distance(splats, s, near_x, best_y), _distance(splats, s, best_x, near_y))
-    return bits(least <= broadcast(splats, s + REACH))
+    return bits(least <= splats[s + REACH])
 
 
 @inline
@@ -140,9 +137,9 @@ def _distance(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> Lanes:
 @inline
 def falloff(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Return u, v, and the logarithm of alpha before the cap, to base 2, at offsets from a splat's centre."""
-    u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
-    v = dy * broadcast(splats, s + FACTOR_YY)
-    return u, v, fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+    u = fma(dx, splats[s + FACTOR_XX], dy * splats[s + FACTOR_XY])
+    v = dy * splats[s + FACTOR_YY]
+    return u, v, fma(-u, u, fma(-v, v, splats[s + LOG2_OPACITY]))
 
 
 # ------------------------------------------------------------------------------------------------ forward
@@ -171,6 +168,7 @@ def blend(
     scratch, integers = _aligned(_FORWARD * TILE_PIXELS, splats), np.empty(BLOCKS * (BATCH + 1), np.int64)
     state, lists, counts = borrowed(scratch), borrowed(integers), borrowed(integers[BLOCKS * BATCH :])
     splats, background, offsets, members = borrowed(splats), borrowed(background), borrowed(offsets), borrowed(members)
+    tile_start, reached = borrowed(tile_start), borrowed(reached)
     image, transmittance, hits, final = borrowed(image), borrowed(transmittance), borrowed(hits), borrowed(final)
     while True:
         tile = fetch_add(counter, 1)
@@ -178,7 +176,7 @@ def blend(
             break
         tile_y, tile_x = divmod(tile, tiles_x)
         alive = _open_tile(state, offsets, tile_x, tile_y, width, height)
-        start, end = at(tile_start, tile), at(tile_start, tile + 1)
+        start, end = tile_start[tile], tile_start[tile + 1]
         batch = start
         while batch < end and alive != 0:
             size = min(end - batch, BATCH)
@@ -191,9 +189,9 @@ def blend(
                 if done >= 0:
                     alive &= ~(1 << block)
                     if keep:
-                        for j in range(done, at(counts, block)):
-                            pair = at(lists, block * BATCH + j)
-                            put(hits, pair, at(hits, pair) & ~(1 << block))
+                        for j in range(done, counts[block]):
+                            pair = lists[block * BATCH + j]
+                            hits[pair] = hits[pair] & ~(1 << block)
             batch += size
         if keep:
             reached[tile] = batch - start
@@ -229,19 +227,19 @@ def _list_by_block(
     """List the pairs from `batch` on for each block that they reach."""
     left, top = load(offsets, _CORNERS) + tile_x * TILE, load(offsets, _CORNERS + WIDTH) + tile_y * TILE
     for block in range(BLOCKS):
-        put(counts, block, 0)
+        counts[block] = 0
     last = batch + size - 1
     for pair in range(batch, batch + size):
-        prefetch(splats, at(members, min(pair + AHEAD, last)) * SPLAT)
-        reached = _blocks_reached(splats, at(members, pair) * SPLAT, left, top) & alive
+        prefetch(splats, members[min(pair + AHEAD, last)] * SPLAT)
+        reached = _blocks_reached(splats, members[pair] * SPLAT, left, top) & alive
         if keep:
-            put(hits, pair, reached)
+            hits[pair] = reached
         while reached != 0:
             block = lowest_bit(reached)
             reached &= reached - 1
-            count = at(counts, block)
-            put(lists, block * BATCH + count, pair)
-            put(counts, block, count + 1)
+            count = counts[block]
+            lists[block * BATCH + count] = pair
+            counts[block] = count + 1
 
 
 @inline
@@ -261,19 +259,19 @@ def _blend_block(
     )  # fmt: skip
     x, y = pixels_x(offsets, block, tile_x), pixels_y(offsets, block, tile_y)
     done = -1
-    for j in range(at(counts, block)):
-        pair = at(lists, block * BATCH + j)
-        s = at(members, pair) * SPLAT
-        dx, dy = x - broadcast(splats, s + CENTRE_X), y - broadcast(splats, s + CENTRE_Y)
+    for j in range(counts[block]):
+        pair = lists[block * BATCH + j]
+        s = members[pair] * SPLAT
+        dx, dy = x - splats[s + CENTRE_X], y - splats[s + CENTRE_Y]
         _, _, exponent = falloff(splats, s, dx, dy)
         alpha = minimum(exp2(exponent), MAX_ALPHA)
         visible = exponent >= LOG2_MIN_ALPHA
         behind = fma(-alpha, t, t)
         blended = visible & (behind >= MIN_TRANSMITTANCE)
         weight = select(blended, alpha * t, 0.0)
-        red = fma(weight, broadcast(splats, s + RED), red)
-        green = fma(weight, broadcast(splats, s + GREEN), green)
-        blue = fma(weight, broadcast(splats, s + BLUE), blue)
+        red = fma(weight, splats[s + RED], red)
+        green = fma(weight, splats[s + GREEN], green)
+        blue = fma(weight, splats[s + BLUE], blue)
         last = select(blended, splat(splats, pair - start + 1), last)
         t = select(blended, behind, select(visible, minimum(t, -t), t))
         if not any_lane(t > 0.0):
@@ -300,7 +298,7 @@ def _close_tile(
         store(state, place + _T * WIDTH, t)
         for channel in range(3):
             color = load(state, place + (_R + channel) * WIDTH)
-            store(state, place + (_R + channel) * WIDTH, fma(t, at(background, channel), color))
+            store(state, place + (_R + channel) * WIDTH, fma(t, background[channel], color))
         block_y, block_x = divmod(block, TILE // BLOCK)
         first_x = tile_x * TILE + block_x * BLOCK
         first_y = tile_y * TILE + block_y * BLOCK
@@ -308,10 +306,10 @@ def _close_tile(
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
                 lane = place + row * BLOCK + column
-                put(transmittance, pixel, at(state, lane + _T * WIDTH))
-                put(image, pixel, at(state, lane + _R * WIDTH))
-                put(image, pixels + pixel, at(state, lane + _G * WIDTH))
-                put(image, 2 * pixels + pixel, at(state, lane + _B * WIDTH))
+                transmittance[pixel] = state[lane + _T * WIDTH]
+                image[pixel] = state[lane + _R * WIDTH]
+                image[pixels + pixel] = state[lane + _G * WIDTH]
+                image[2 * pixels + pixel] = state[lane + _B * WIDTH]
 
 
 # ------------------------------------------------------------------------------------------------ backward
@@ -340,6 +338,7 @@ def blend_backward(
     scratch = _aligned(_BACKWARD * TILE_PIXELS, splats)
     state, splats, background, offsets = borrowed(scratch), borrowed(splats), borrowed(background), borrowed(offsets)
     members, hits, final, slots = borrowed(members), borrowed(hits), borrowed(final), borrowed(slots)
+    tile_start, reached = borrowed(tile_start), borrowed(reached)
     grad_image, grad_transmittance = borrowed(grad_image), borrowed(grad_transmittance)
     while True:
         tile = fetch_add(counter, 1)
@@ -350,14 +349,14 @@ def blend_backward(
             state, tile, tile_x, tile_y, width, height, background, final, grad_image, grad_transmittance,
             by_transmittance,
         )  # fmt: skip
-        start = at(tile_start, tile)
-        end = start + at(reached, tile)
+        start = tile_start[tile]
+        end = start + reached[tile]
         none = splat(slots, 0.0)
-        for pair in range(end, at(tile_start, tile + 1)):
+        for pair in range(end, tile_start[tile + 1]):
             store(slots, pair * SLOT, none)
         for pair in range(end - 1, start - 1, -1):
-            prefetch(splats, at(members, max(pair - AHEAD, start)) * SPLAT)
-            blocks = at(hits, pair)
+            prefetch(splats, members[max(pair - AHEAD, start)] * SPLAT)
+            blocks = int(hits[pair])
             if blocks == 0:
                 store(slots, pair * SLOT, none)
             else:
@@ -383,15 +382,15 @@ def _reopen_tile(
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
                 lane = place + row * BLOCK + column
-                put(state, lane + _GRAD_R * WIDTH, at(grad_image, pixel))
-                put(state, lane + _GRAD_G * WIDTH, at(grad_image, pixels + pixel))
-                put(state, lane + _GRAD_B * WIDTH, at(grad_image, 2 * pixels + pixel))
+                state[lane + _GRAD_R * WIDTH] = grad_image[pixel]
+                state[lane + _GRAD_G * WIDTH] = grad_image[pixels + pixel]
+                state[lane + _GRAD_B * WIDTH] = grad_image[2 * pixels + pixel]
                 if by_transmittance:
-                    put(state, lane + _REST * WIDTH, at(grad_transmittance, pixel))
+                    state[lane + _REST * WIDTH] = grad_transmittance[pixel]
         t = load(final, tile * FINAL + 2 * block * WIDTH)
         rest = load(state, place + _REST * WIDTH)
         for channel in range(3):
-            rest = fma(load(state, place + (_GRAD_R + channel) * WIDTH), at(background, channel), rest)
+            rest = fma(load(state, place + (_GRAD_R + channel) * WIDTH), background[channel], rest)
         store(state, place + _T_BEHIND * WIDTH, t)
         store(state, place + _REST * WIDTH, t * rest)
         store(state, place + _FINAL * WIDTH, load(final, tile * FINAL + (2 * block + 1) * WIDTH))
@@ -408,8 +407,8 @@ def _splat_backward(
     derivative by the transmittance behind it times that transmittance. The derivative by alpha is
     T c - R / (1 - alpha). In front of the splat, R is larger by alpha T c.
     """
-    s = at(members, pair) * SPLAT
-    xy, yy = broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
+    s = members[pair] * SPLAT
+    xy, yy = splats[s + FACTOR_XY], splats[s + FACTOR_YY]
     position = splat(splats, pair - start + 1)
     none = splat(splats, 0.0)
     sum_red, sum_green, sum_blue = none, none, none
@@ -420,11 +419,11 @@ def _splat_backward(
         blocks &= blocks - 1
         place = _BACKWARD * block * WIDTH
         # As `falloff`, with xy and yy in registers. The others are loaded again in each block; they would be spilled.
-        dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
-        dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
-        u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * xy)
+        dx = pixels_x(offsets, block, tile_x) - splats[s + CENTRE_X]
+        dy = pixels_y(offsets, block, tile_y) - splats[s + CENTRE_Y]
+        u = fma(dx, splats[s + FACTOR_XX], dy * xy)
         v = dy * yy
-        exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+        exponent = fma(-u, u, fma(-v, v, splats[s + LOG2_OPACITY]))
         density = exp2(exponent)
         alpha = minimum(density, MAX_ALPHA)
         blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, place + _FINAL * WIDTH) >= position)
@@ -436,8 +435,8 @@ def _splat_backward(
         )
         inverse = select(blended, 1.0 / (1.0 - alpha), 1.0)
         in_front = t * inverse
-        shade = grad_blue * broadcast(splats, s + BLUE)
-        shade = fma(grad_red, broadcast(splats, s + RED), fma(grad_green, broadcast(splats, s + GREEN), shade))
+        shade = grad_blue * splats[s + BLUE]
+        shade = fma(grad_red, splats[s + RED], fma(grad_green, splats[s + GREEN], shade))
         weight = select(blended, alpha * in_front, 0.0)
         store(state, place + _T_BEHIND * WIDTH, in_front)
         store(state, place + _REST * WIDTH, fma(weight, shade, rest))

@@ -187,10 +187,10 @@ class HierarchyRenderer:
             UserInputError: it is not there.
         """
         if not self.finest <= level < self.levels:
-            raise UserInputError(
-                f"level {level} cannot be rendered, expected {self.finest} to {self.levels - 1}; "
-                "levels count from 0, the finest, and this run has no others"
-            )
+            last = self.levels - 1
+            expected = str(last) if self.finest == last else f"{self.finest} to {last}"
+            why = "finer levels are not finished, or were not read" if 0 <= level < self.finest else "0 is the finest"
+            raise UserInputError(f"level {level} cannot be rendered, expected {expected}; {why}")
 
     def level_for_size(self, camera: Camera, size: tuple[int, int]) -> int:
         """Return the level of detail for an image size: the coarsest level that is not smaller, or else the finest.

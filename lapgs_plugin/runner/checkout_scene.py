@@ -34,7 +34,8 @@ class CheckoutScene:
         """
         model = _PointRecorder()
         own = call.changed(dataset=with_values(call.dataset, {"model_path": str(folder)}))
-        scene = adapter.profile.make_scene(own.values, model)
+        with own.own_folder():
+            scene = adapter.profile.make_scene(own.values, model)
         if not hasattr(model, "points"):
             raise UserInputError(
                 f"the Scene of {adapter.root} initialised no model with create_from_pcd, expected of "

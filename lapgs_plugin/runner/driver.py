@@ -109,11 +109,10 @@ class HierarchyDriver:
         Raises:
             LapgsError: the checkout, its options, the scene and the hierarchy do not go together.
         """
-        model = self._adapter.profile.model
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
-            counting_steps(model, lambda: self._context.running.stage),
+            counting_steps(self._adapter.profile, lambda: self._context.running.stage),
         ):
             self._adapter.script.run_main()
 

@@ -10,6 +10,7 @@ import copy
 import io
 import logging
 import random
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
+from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import TrainingCall
@@ -152,7 +154,7 @@ class DryRun:
             values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
             values["dataset"].model_path = str(folder)
             call = self._call.changed(**values)
-        return call.changed(**{name: [] for name in call.iteration_lists})
+        return call.listing(lambda _: [])
 
     def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
         """Return the checkout's scene with views of the tried stage, and make Gaussians of some of its points."""
@@ -278,17 +280,20 @@ class DryRun:
         except (LapgsError, torch.cuda.OutOfMemoryError):
             raise
         except Exception as error:
+            place = place_of(error, self._adapter)
             raise UserInputError(
-                f"dry run: {what} failed at {self._place(error)}: {typed_line(error)}; expected {expected}; {works}"
+                f"dry run: {what} failed at {place}: {typed_line(error)}; expected {expected}; {works}"
             ) from error
 
-    def _place(self, error: Exception) -> str:
-        """Return file and line of the checkout's code in which an error was raised."""
-        root = self._adapter.root
-        frames = traceback.extract_tb(error.__traceback__)
-        own = [frame for frame in frames if Path(frame.filename).is_relative_to(root)] or frames
-        path = Path(own[-1].filename)
-        return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{own[-1].lineno}"
+
+def place_of(error: Exception, adapter: BackboneAdapter) -> str:
+    """Return file and line, of the checkout or of another package's adapter of it, in which an error was raised."""
+    root, modules = adapter.root, [each.__module__ for each in type(adapter).__mro__]
+    brought = {getattr(sys.modules[name], "__file__", None) for name in modules if not name.startswith("lapgs_plugin.")}
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [each for each in frames if Path(each.filename).is_relative_to(root) or each.filename in brought] or frames
+    path = Path(own[-1].filename)
+    return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{own[-1].lineno}"
 
 
 class _Enough(BaseException):

@@ -60,7 +60,7 @@ class BareRunRecorder:
         Raises:
             UserInputError: the script never trained.
         """
-        with Attachment(self._replacements()), counting_steps(self._adapter.profile.model, lambda: self):
+        with Attachment(self._replacements()), counting_steps(self._adapter.profile, lambda: self):
             self._adapter.script.run_main()
         if self._call is None or self.iteration == 0:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")

@@ -14,7 +14,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
-from lapgs_plugin.runner.step_clock import timing_replacements
+from lapgs_plugin.runner.step_clock import is_trained, timing_replacements
 
 SIZE_LIMIT = "max_screen_size"
 """Parameter of the family's density control: with None it removes no Gaussian for its size."""
@@ -132,7 +132,14 @@ class StageReplacements:
         def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
             if (stage := self._running()) is not None:
-                stage.optimizers_made(gaussians)
+                if is_trained(stage, gaussians):
+                    stage.optimizers_made(gaussians)
+                elif stage.stage.signed:
+                    raise UserInputError(
+                        f"{self._context.adapter.profile.source.model[1]}: training() sets up the optimizers of more "
+                        "than one model, and a residual is one, added to what was finished; nested levels train all of "
+                        "them, and keep that of the scene: --hierarchy nested"
+                    )
             return result
 
         return training_setup
@@ -147,7 +154,7 @@ class StageReplacements:
                 result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
-            if outermost and (stage := self._running()) is not None:
+            if outermost and (stage := self._running()) is not None and is_trained(stage, gaussians):
                 stage.densified(gaussians)
             return result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -14,6 +15,14 @@ from lapgs_plugin.checkouts.profile import Profile
 
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
+
+
+def has_clock(profile: Profile) -> bool:
+    """Return whether a checkout's loop calls `CLOCK` before its backward pass; some call it at an iteration's end."""
+    calls = [node for node in ast.walk(profile.source.training) if isinstance(node, ast.Call)]
+    methods = [(call.func.attr, call.lineno) for call in calls if isinstance(call.func, ast.Attribute)]
+    first = dict(sorted(methods, key=lambda method: -method[1]))
+    return hasattr(profile.model, CLOCK) and first.get(CLOCK, 0) < first["backward"]
 
 
 def steps_positions(optimizer: Optimizer, gaussians: Any) -> bool:
@@ -34,7 +43,7 @@ def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Re
     def make_clock(original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            if (stage := running()) is not None:
+            if (stage := running()) is not None and is_trained(stage, gaussians):
                 stage.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
             return original(gaussians, *args, **kwargs)
 
@@ -50,23 +59,29 @@ def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Re
 
         return save
 
+    clock = of_class(profile.model, CLOCK, make_clock, "training() at the start of every iteration")
     return [
-        *of_class(profile.model, CLOCK, make_clock, "training() at the start of every iteration"),
+        *(clock if has_clock(profile) else ()),
         *of_class(profile.scene, "save", make_save, "training() at --save_iterations"),
     ]
 
 
+def is_trained(stage: Any, gaussians: Any) -> bool:
+    """Return whether a model is that of the scene, which a stage archives: some forks train more models beside it."""
+    return stage.gaussians is None or stage.gaussians is gaussians
+
+
 @contextmanager
-def counting_steps(model: type, running: Callable[[], Any]) -> Iterator[None]:
-    """Begin an iteration after each step of the running stage's positions, unless the model has the method `CLOCK`.
+def counting_steps(profile: Profile, running: Callable[[], Any]) -> Iterator[None]:
+    """Begin an iteration after each step of the running stage's positions, unless the loop calls the method `CLOCK`.
 
     The first begins before the first step. So the loop may leave out the step of the last iteration.
 
     Args:
-        model: class of the Gaussians.
+        profile: the checkout's.
         running: returns the running stage, that of the dry run, or a recorder; None between stages.
     """
-    if hasattr(model, CLOCK):
+    if has_clock(profile):
         yield
         return
 

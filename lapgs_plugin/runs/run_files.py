@@ -7,13 +7,13 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.files import FolderLock, one_line_errors, write_text
 from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import HistoryEntry, Metrics
 from lapgs_plugin.runs.tensors import read_tensors, write_tensors
-from lapgs_plugin.untrusted import read_json, read_json_lines, shortened
+from lapgs_plugin.untrusted import checked, read_json, read_json_lines, shortened
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -63,15 +63,11 @@ class RunFiles:
                 the run), "loss", "num_gaussians" and "psnr".
 
         Raises:
-            UserInputError: it has no level or iteration, or a number that is not finite.
+            UserInputError: it has no level or iteration, a value of another type, or a number that is not finite.
         """
         self._require_lock()
-        if missing := {"level", "iteration"} - entry.keys():
-            raise UserInputError(f"a history entry without {' and '.join(sorted(missing))}: it says where it belongs")
-        try:
-            line = json.dumps(entry, allow_nan=False) + "\n"
-        except (ValueError, TypeError) as error:
-            raise UserInputError(f"history entry {shortened(entry)}: {error}; expected finite numbers") from None
+        checked(entry, HistoryEntry, "the history entry", advice="it could not be read again")
+        line = json.dumps(entry, allow_nan=False) + "\n"
         path = self.path(HISTORY)
         with one_line_errors(path, training=True), path.open("a", encoding="utf-8") as stream:
             stream.write(line)

@@ -17,7 +17,7 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.strategies import Gradients
+from lapgs_plugin.training.strategies import Gradients, Strategy
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,21 @@ class DensityControl:
         if self._scale_weight:
             terms.append(self._scale_weight * torch.exp(field.log_scales).mean())
         return sum(terms[1:], terms[0]) if terms else None
+
+
+def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> DensityControl:
+    """Return the density control that a strategy makes for a stage; arguments as `Strategy.density_control` takes them.
+
+    Raises:
+        UserInputError: it makes something else.
+    """
+    made: object = strategy.density_control(schedule, extent)
+    if not isinstance(made, DensityControl):
+        raise UserInputError(
+            f"strategy {type(strategy).__qualname__}: density_control returned a {type(made).__name__}, expected a "
+            "DensityControl"
+        )
+    return made
 
 
 class Densifier(DensityControl):

@@ -66,6 +66,8 @@ def view_scores(views: Iterable[ScoredView], coefficients: Tensor, threshold: fl
     """
     pixels = torch.zeros_like(coefficients[:, 0, 0], requires_grad=False)
     blame, count = torch.zeros_like(pixels), 0
+    if len(coefficients) == 0:  # density control may have removed all
+        return ViewScores(pixels, blame)
     for view in views:
         wrong = large_errors(view.prediction, view.target, threshold)
         # The weight of a Gaussian in a pixel is the derivative of that pixel by the Gaussian's colour.

@@ -28,6 +28,7 @@ from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.densification import control_of
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -100,7 +101,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             device=self.device,
             monitor=self.monitor,
-            plan=make_plan(trained.smallest_size, self.settings, len(views)),
+            plan=make_plan(self.scene.smallest_size, self.settings, len(views)),
             first_field=self.first_field,
         )
         check_storage(self.settings, self.device)
@@ -286,7 +287,7 @@ class Trainer:
             rasterizer=self.rasterizer,
             hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
             model=model,
-            densifier=self._strategy_of(stage).density_control(schedule, context.scene.extent),
+            densifier=control_of(self._strategy_of(stage), schedule, context.scene.extent),
             coarser=CoarserLevels(images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown),
             exposures=first_exposures(context, stage, checkpoint, overhead),
             poses=poses,

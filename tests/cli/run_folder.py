@@ -98,7 +98,3 @@ def write_run(
             elapsed += SECONDS[level]
             archive.finish_level(record, replace(field, sh=sh, signed=signed))
     return folder
-
-
-def files_in(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}

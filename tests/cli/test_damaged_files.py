@@ -23,7 +23,8 @@ from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import HISTORY, METRICS
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import files_in, write_run
+from tests.cli.run_folder import write_run
+from tests.folders import files_in
 from tests.mishaps import FailingWrites, disk_full
 
 app = typer.Typer()

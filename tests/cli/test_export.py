@@ -13,7 +13,8 @@ from lapgs_plugin.cli.export import export
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import files_in, write_run, write_scene
+from tests.cli.run_folder import write_run, write_scene
+from tests.folders import files_in
 from tests.unit.test_spz import read_spz
 
 app = typer.Typer()

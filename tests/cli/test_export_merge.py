@@ -25,8 +25,9 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.training import merge, stage_start, trainer
 from lapgs_plugin.training.merge import FAINT, first_field
-from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
+from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
+from tests.folders import files_in
 
 
 def _kept(run: Path, field: GaussianField) -> float:

@@ -20,8 +20,9 @@ from lapgs_plugin.fields.splat import LAYOUT, splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.runs.archive import RunArchive
-from tests.cli.run_folder import BACKGROUND, files_in, write_run, write_scene
+from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
+from tests.folders import files_in
 from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
 from tests.training_scene import HEIGHT, WIDTH, blob_field
 

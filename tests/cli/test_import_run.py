@@ -27,7 +27,8 @@ from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import files_in, write_scene
+from tests.cli.run_folder import write_scene
+from tests.folders import files_in
 from tests.training_scene import blob_field
 
 app = typer.Typer()

@@ -20,7 +20,8 @@ from lapgs_plugin.rendering.trajectory import trajectory_json
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import files_in, write_run, write_scene
+from tests.cli.run_folder import write_run, write_scene
+from tests.folders import files_in
 
 app = typer.Typer()
 app.command("render")(render)

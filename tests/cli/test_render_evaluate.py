@@ -24,7 +24,8 @@ from lapgs_plugin.rendering.images import caption_height
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import SECONDS, files_in, write_run, write_scene
+from tests.cli.run_folder import SECONDS, write_run, write_scene
+from tests.folders import files_in
 
 app = typer.Typer()
 app.command("render")(render)
@@ -98,7 +99,7 @@ def test_an_interrupted_run_renders_what_is_there_and_is_not_measured(scene: Pat
     run = write_run(tmp_path / "run", scene, finished=1)
     lapgs("render", run)
     assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
-    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1; finer"):
         lapgs("render", run, "--level", 0)
     with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
         lapgs("eval", run)

@@ -10,9 +10,9 @@ from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from tests.contract.stub_runs import NAMES, STUBS, THIRDS, run_hierarchy
+from tests.contract.stub_runs import KINDS, NAMES, SHORT, STUBS, THIRDS, run_hierarchy
 
-SHORT = ("--iterations", 30, "--densify_from_iter", 0, "--densification_interval", 3, "--densify_until_iter", 30)
+OFTEN = ("--densify_from_iter", 0, "--densification_interval", 3, "--densify_until_iter", 30)
 EVERY = 4
 
 
@@ -26,17 +26,16 @@ def rendered(archive: RunArchive, level: int) -> float:
     return sum(values) / len(values)
 
 
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
-    ("hierarchy", "supervision"),
-    [("nested", "reconstructed"), ("laplacian", "reconstructed"), ("laplacian", "gt_laplacian")],
+    ("name", "hierarchy", "supervision"),
+    [*((name, kind, "reconstructed") for name in NAMES for kind in KINDS), ("graphdeco", "laplacian", "gt_laplacian")],
 )
 def test_curves_leave_no_trace(scene: Path, tmp_path: Path, name: str, hierarchy: str, supervision: str) -> None:
     runs = {}
     for every in (None, EVERY):
         folder = tmp_path / str(every)
         options = {"hierarchy": hierarchy, "supervision": supervision, "joint": 0.0, **THIRDS}
-        runs[every], _ = run_hierarchy(STUBS[name], scene, folder, *SHORT, test_every=every, **options)
+        runs[every], _ = run_hierarchy(STUBS[name], scene, folder, *SHORT, *OFTEN, test_every=every, **options)
     plain, measured = runs[None], runs[EVERY]
     for level in (1, 0):
         assert measured.field_path(level).read_bytes() == plain.field_path(level).read_bytes()

@@ -119,15 +119,20 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     """2DGS has no `debug_from`, Speedy-Splat `visualize_iterations`, EfficientGS `no_gui`."""
     given: list[Any] = []
 
-    def training(cfg: Any, options: Any, visualize_iterations: list[int], no_gui: bool = True) -> None:
-        given.append((cfg, options, visualize_iterations, no_gui))
+    def training(
+        cfg: Any, options: Any, visualize_iterations: list[int], no_gui: bool = True, args: Any = None
+    ) -> None:
+        given.append((cfg, options, visualize_iterations, no_gui, args))
 
     cfg = SimpleNamespace(source_path="scene", model_path="out", white_background=True)
     options = SimpleNamespace(iterations=30, feature_lr=0.1, densify_grad_threshold=0.2)
+    parsed = Namespace(depth_pseudo_weight=0.5, test_iterations=[7, 25])
     with loaded(STUBS["graphdeco"], scene, tmp_path) as adapter:
-        call = TrainingCall.bind(training, (cfg, options, [5, 15]), {})
+        call = TrainingCall.bind(training, (cfg, options, [5, 15]), {"args": parsed})
         adapter.stage_call(call, WINDOW, "run/level_0").run()
-    ((own, changed, visualized, gui),) = given
+    ((own, changed, visualized, gui, args),) = given
+    assert (args.depth_pseudo_weight, args.test_iterations) == (0.0, [15]), "of a residual"
+    assert (parsed.depth_pseudo_weight, parsed.test_iterations) == (0.5, [7, 25])
     assert (own.model_path, own.white_background, cfg.model_path) == ("run/level_0", False, "out")
     assert (changed.iterations, changed.feature_lr, changed.densify_grad_threshold) == (20, 0.4, 0.4)
     assert (visualized, gui) == ([5], True)
@@ -153,6 +158,19 @@ def test_options_in_a_global_variable_name_the_output_folder_of_the_call() -> No
         assert (names["args"].model_path, own.model_path) == ("out", "out"), "put back"
     assert names["written"] == ["out/level_1"] * 4
     assert vars(names["other"]) == {"quiet": True}
+
+
+def test_iterations_among_parsed_options_are_the_calls() -> None:
+    """FSGS and CoR-GS give `training` all of the script's options, and the lists with them."""
+    args = Namespace(test_iterations=[7, 25], save_iterations=[12, 30], iterations=30, start_checkpoint="old.pth")
+    dataset, opt = SimpleNamespace(source_path="scene"), SimpleNamespace(iterations=30)
+    call = TrainingCall.bind(lambda dataset, opt, args: None, (dataset, opt, args), {})
+    assert (call.checkpoint, call.test_iterations) == ("old.pth", [7, 25])
+    own = call.listing(WINDOW.local).values["args"]
+    assert (own.test_iterations, own.save_iterations, own.iterations) == ([15], [2, 20], 30)
+    assert args.test_iterations == [7, 25], "the script's own are not changed"
+    given = call.changed(args=Namespace(iterations=30))
+    assert (given.checkpoint, given.test_iterations) == (None, ())
 
 
 def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:

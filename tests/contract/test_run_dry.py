@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +50,35 @@ def test_a_run_after_a_dry_run_is_the_bare_run(name: str, scene: Path, tmp_path:
     assert RunArchive.open(tmp_path / "run").manifest.complete
     printed = [line for line in results[0].lines if "initialisation" in line]
     assert len(printed) == 1, "the dry run prints nothing"
+
+
+def test_the_place_of_an_error_is_in_the_checkout_or_in_a_packages_adapter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modules = {}
+    for name in ("checkout/scene", "site/tiny_adapter", "site/elsewhere"):
+        path = tmp_path / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("class Adapter:\n    pass\n\n\ndef call(function):\n    function()\n")
+        modules[name] = module = ModuleType(path.stem)
+        module.__file__ = str(path)
+        monkeypatch.setitem(sys.modules, path.stem, module)
+        exec(compile(path.read_text(), path, "exec"), vars(module))
+    checkout, site, elsewhere = (module.call for module in modules.values())
+    adapter = modules["site/tiny_adapter"].Adapter()
+    adapter.root = tmp_path / "checkout"
+
+    def place(function: Callable[[], object]) -> str:
+        with pytest.raises(ZeroDivisionError) as caught:
+            function()
+        return dry_run.place_of(caught.value, adapter)
+
+    def fails() -> None:
+        elsewhere(lambda: 1 / 0)
+
+    assert place(lambda: checkout(lambda: site(fails))) == "tiny_adapter.py:6"
+    assert place(lambda: site(lambda: checkout(fails))) == "scene.py:6"
+    assert place(fails).startswith("test_run_dry.py:"), "the innermost, where neither takes part"
 
 
 FAILURES = {

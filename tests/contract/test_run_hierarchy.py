@@ -23,6 +23,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
+    SHORT,
     STUBS,
     Result,
     StopAt,
@@ -189,7 +190,7 @@ def test_ablations_compare_the_residual_alone(name: str, supervision: str, scene
     """The checkout's L1 gets the images to check, at the first iteration of the second stage."""
     compared: list[tuple[Tensor, Tensor]] = []
     recorder = Recorder()
-    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *SHORT) as adapter:
         original = adapter.train.l1_loss
 
         def spy(image: Tensor, target: Tensor) -> Tensor:
@@ -222,7 +223,7 @@ def test_a_residual_starts_from_the_field_before(name: str, inherit: str, scene:
     """Return the checkout's model at the first iteration of the second stage."""
     at_start: list[dict[str, Tensor]] = []
     parts = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc")
-    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *SHORT) as adapter:
         model = adapter.train.GaussianModel
         original = model.training_setup
 

@@ -38,6 +38,7 @@ from tests.contract.stub_runs import (
     run_residuals,
 )
 from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
+from tests.training_runs import plys
 
 
 class FieldsAt(StageHook):
@@ -284,10 +285,6 @@ def two_finished(scene: Path, folder: Path, name: str = "graphdeco") -> Path:
     with captured(folder, []), pytest.raises(KeyboardInterrupt):
         three_levels(scene, folder, StopAt(0), name=name, resume=False)
     return folder
-
-
-def plys(archive: RunArchive) -> list[bytes]:
-    return [archive.field_path(level).read_bytes() for level in archive.available_levels]
 
 
 @pytest.mark.slow

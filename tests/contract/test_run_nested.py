@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
@@ -267,6 +268,48 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str,
     # A call's first iteration begins with its first step, after its render.
     assert contexts[:30] == [(1, 0), *((1, i) for i in range(2, 31))]
     assert [level for level, _ in contexts[30:]] == [0] * 60
+
+
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_a_loop_that_trains_a_second_model_and_sets_learning_rates_at_its_end(
+    hierarchy: str, scene: Path, tmp_path: Path
+) -> None:
+    """As CoR-GS: the calls of a second model are no iterations, and neither is the last one's an iteration's begin."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text = script.read_text(encoding="utf-8")
+    for old, new in (
+        ("        gaussians.update_learning_rate(iteration)\n", ""),
+        (
+            "    gaussians.training_setup(opt)\n",
+            "    gaussians.training_setup(opt)\n    import copy\n    other = copy.deepcopy(gaussians)\n"
+            "    other.training_setup(opt)\n",
+        ),
+        (
+            "            if iteration < opt.iterations:\n",
+            "            for each in (gaussians, other):\n                each.update_learning_rate(iteration)\n"
+            "            other.optimizer.step()\n            if iteration < opt.iterations:\n",
+        ),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    script.write_text(text, encoding="utf-8")
+    levels: list[int] = []
+
+    class Noting(StageHook):
+        def before_render(self, context: StageContext) -> None:
+            levels.append(context.stage.level)
+
+    several = pytest.raises(UserInputError, match=r"more than one model, and a residual is one, .*--hierarchy nested")
+    more = ("--iterations", 30)
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *more, script=script) as adapter,
+        several if hierarchy == "laplacian" else nullcontext(),
+    ):
+        drive(adapter, hooks=(Noting(),), hierarchy=hierarchy, dry_run=True, **THIRDS)
+    assert levels == ([] if hierarchy == "laplacian" else [1] * 10 + [0] * 20)
+    assert (tmp_path / "run").exists() == (hierarchy == "nested")
 
 
 def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(

@@ -19,6 +19,7 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from tests.contract.stub_runs import (
     NAMES,
     SCHEDULE,
+    SHORT,
     STUBS,
     Result,
     arguments,
@@ -103,7 +104,7 @@ class Failing(StageHook):
 @pytest.mark.parametrize("fails", [False, True], ids=["whole", "broken"])
 @pytest.mark.parametrize("name", NAMES)
 def test_symbols_are_restored_by_identity(name: str, fails: bool, scene: Path, tmp_path: Path) -> None:
-    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *SHORT) as adapter:
         before = symbols(adapter)
         assert ("gaussian_renderer", "GaussianRasterizer") in before
         assert ("__main__.GaussianModel", "update_learning_rate") in before

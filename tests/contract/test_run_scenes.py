@@ -26,6 +26,7 @@ from tests.contract.stub_runs import (
     ITERATIONS,
     KINDS,
     NAMES,
+    SHORT,
     STUBS,
     THIRDS,
     WHITE,
@@ -39,8 +40,6 @@ from tests.contract.stub_runs import (
     run_hierarchy,
     run_residuals,
 )
-
-SHORT = ("--iterations", 30)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def rasterized(stub: Stub, scene: Path, folder: Path, *more: Any, **options: Any
 def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, tmp_path: Path) -> None:
     by_size: dict[int, set[tuple[float, ...]]] = {}
     degrees: dict[int, set[int]] = {}
-    for settings in rasterized(STUBS[name], scene, tmp_path / "run", *WHITE, joint=0.0):
+    for settings in rasterized(STUBS[name], scene, tmp_path / "run", *WHITE, *SHORT, joint=0.0):
         by_size.setdefault(settings.image_width, set()).add(tuple(settings.bg.tolist()))
         degrees.setdefault(settings.image_width, set()).add(settings.sh_degree)
     assert by_size == {32: {(1.0, 1.0, 1.0)}, 64: {(0.0, 0.0, 0.0)}}
@@ -137,7 +136,7 @@ def test_photos_on_end_between_photos_across(blender: Path, tmp_path: Path) -> N
 def test_transparent_images_train(name: str, hierarchy: str, blender: Path, tmp_path: Path) -> None:
     """graphdeco masks its renders by alpha at each level's size; the others see the background in the photo."""
     compared: list[tuple[Tensor, Tensor]] = []
-    with captured(tmp_path, []), loaded(STUBS[name], blender, tmp_path / "run", *WHITE) as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], blender, tmp_path / "run", *WHITE, *SHORT) as adapter:
         original = adapter.train.l1_loss
 
         def spy(image: Tensor, photo: Tensor) -> Tensor:
@@ -234,7 +233,7 @@ def test_exposures_survive_a_stop(hierarchy: str, scene: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize("name", ["taming", "graphdeco"])
 def test_sparse_adam_trains_a_hierarchy(name: str, scene: Path, tmp_path: Path) -> None:
-    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", "--optimizer_type", "sparse_adam")
+    archive, result = run_hierarchy(STUBS[name], scene, tmp_path / "run", *SHORT, "--optimizer_type", "sparse_adam")
     assert archive.manifest.complete
     assert all(0 < loss < 1 for loss in result.losses)
 
@@ -243,7 +242,7 @@ def test_sparse_adam_trains_a_hierarchy(name: str, scene: Path, tmp_path: Path) 
 def test_where_images_lie_changes_nothing(name: str, scene: Path, tmp_path: Path) -> None:
     """The place of images does not change the result, ours or the checkout's."""
     (_, memory), (_, disk), (_, told) = (
-        run_residuals(STUBS[name], scene, tmp_path / how, *more, images_on=where)
+        run_residuals(STUBS[name], scene, tmp_path / how, *SHORT, *more, images_on=where)
         for how, where, more in (
             ("memory", "memory", ()),
             ("disk", "disk", ()),

@@ -28,6 +28,7 @@ from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, TrainSettings
+from tests.folders import files_in
 from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
 from tests.training_runs import StopAt, plys, resume, train
 from tests.training_scene import ring_scene
@@ -144,10 +145,6 @@ def all_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunA
     return train(tmp_path_factory.mktemp("all") / "run", large, SHORT)
 
 
-def files(folder: Path) -> set[Path]:
-    return {path.relative_to(folder) for path in folder.rglob("*")}
-
-
 def test_a_run_killed_while_it_archives_jointly_trained_fields_ends_as_others(
     large: Scene, tmp_path: Path, two_finished: Path, all_finished: RunArchive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,7 +164,7 @@ def test_a_run_killed_while_it_archives_jointly_trained_fields_ends_as_others(
         assert plys(killed) == (plys(all_finished) if killed.manifest.complete else base)
         again = resume(folder, large, SHORT)
         assert plys(again) == plys(all_finished)
-        assert files(folder) == files(all_finished.path())
+        assert files_in(folder) == files_in(all_finished.path())
         left += 1
     assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
 

@@ -20,6 +20,7 @@ from torch import Tensor
 import lapgs_plugin
 from lapgs_plugin import ops
 from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
@@ -117,6 +118,11 @@ def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path
     script: Any = SimpleNamespace(module=SimpleNamespace(SPARSE_ADAM_AVAILABLE=False))
     adapter(script).level_view(view, original, (40, 30), signed=False)
     assert (view.blur, original.blur) == (2.0, 4.0)
+    options = {"dataset": SimpleNamespace(), "opt": SimpleNamespace(densify_grad_threshold=1.0)}
+    call: Any = SimpleNamespace(values=options, roles={name: name for name in options})
+    window: Any = SimpleNamespace(stage=Stage(1, (40, 30), 10, signed=False), threshold_factor=2.0)
+    with pytest.raises(UserInputError, match="--backbone my_fork: the script has no option my_threshold"):
+        adapter(script).stage_call(call, window, "folder")
 
 
 def test_the_strategy_and_the_rasterizer_train_by_name(installed: Path, tmp_path: Path) -> None:

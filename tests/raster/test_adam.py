@@ -21,13 +21,6 @@ from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 SH_SHAPE = (37, 16, 3)
 
 
-@pytest.fixture
-def restored_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 def sh_scale(dtype: torch.dtype = torch.float32) -> Tensor:
     scale = torch.full(SH_SHAPE[1:], 1 / 20, dtype=dtype)
     scale[0] = 1
@@ -145,7 +138,6 @@ def test_inactive_columns_are_left_alone() -> None:
     assert not torch.equal(param[:, :4], before[:, :4])
 
 
-@pytest.mark.usefixtures("restored_threads")
 def test_same_bits_for_any_number_of_threads() -> None:
     values = list(gradients((9000, 3), 5, torch.float32))
     results = []

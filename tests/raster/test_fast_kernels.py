@@ -70,8 +70,9 @@ def rearranged(a: Floats, out: Floats, whole: NDArray[np.int32]) -> None:
         lanes.store(out, 112 + 16 * i, rows[i])
     lanes.store_rows(out, 368, 18, rows[0], rows[1], rows[2])
     lanes.store_whole(whole, 0, three[0], three[2])
-    lanes.put(out, 700, lanes.at(a, 7))
-    lanes.store(out, 701, lanes.broadcast(a, 9))
+    there, here = lanes.borrowed(out), lanes.borrowed(a)
+    there[700] = here[7]
+    lanes.store(there, 701, lanes.splat(here, here[9]))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import kornia
 import pytest
@@ -21,13 +20,6 @@ from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 
 INTERIOR = (slice(None), slice(5, -5), slice(5, -5))
 """Pixels whose window lies inside the image."""
-
-
-@pytest.fixture
-def restored_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def conv_ssim_map(p: Tensor, t: Tensor) -> Tensor:
@@ -158,7 +150,6 @@ def test_measuring_ssim_compiles_nothing_that_training_has_not_compiled() -> Non
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.usefixtures("restored_threads")
 def test_same_bits_for_any_number_of_threads_and_from_run_to_run(dtype: torch.dtype) -> None:
     p, t = images((3, 300, 450))
     results = []

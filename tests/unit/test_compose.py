@@ -327,7 +327,7 @@ def test_a_full_gpu_is_one_line() -> None:
 
 def test_a_gain_of_a_level_that_is_not_there_is_refused() -> None:
     renderer = HierarchyRenderer({1: blobs(1, False)}, 2, Pyramid("camera"), OracleRasterizer())
-    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1 to 1"):
+    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1; finer"):
         renderer.render(CAMERA, level=1, gains={0: 2.0})
 
 

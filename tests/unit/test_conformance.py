@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,15 +23,6 @@ from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics
 from lapgs_plugin.reference_raster import OracleRasterizer, oracle
 
 ORACLE = OracleRasterizer()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_torch_thread() -> Iterator[None]:
-    """Use one OpenMP thread, because the tensors are small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def by_name() -> dict[str, Case]:

@@ -10,14 +10,15 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.training.densification import Densifier
+from lapgs_plugin.training.densification import Densifier, DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview, Regularized, StagePart
+from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview, Regularized, StagePart, Strategy
 from tests.training_scene import blob_field, ring_camera
 
 EXTENT = 2.0
@@ -102,3 +103,29 @@ def test_statistics_of_no_gaussians_are_empty() -> None:
         torch.zeros(2, 0, 2), torch.zeros(2, 0).int(), (8, 6), norms := torch.zeros(0), counts := torch.zeros(0)
     )
     assert len(norms) == len(counts) == 0
+
+
+class Absent(Strategy):
+    """A package's strategy that makes no density control."""
+
+
+class Nothing(Strategy):
+    """One that makes something else."""
+
+    def density_control(self, schedule: StageSchedule, extent: float) -> Any:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("strategy", "message"),
+    [
+        (Absent(), "strategy Absent has no method density_control"),
+        (Nothing(), "strategy Nothing: density_control returned a NoneType, expected a DensityControl"),
+    ],
+)
+def test_a_strategy_that_makes_no_density_control_is_one_line(strategy: Strategy, message: str) -> None:
+    schedule: Any = None
+    with pytest.raises(UserInputError, match=message):
+        control_of(strategy, schedule, 1.0)
+    with pytest.raises(UserInputError, match="density control DensityControl has no method after_step"):
+        DensityControl().after_step(schedule, 1, None, ring_camera(0.0))

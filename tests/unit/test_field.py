@@ -269,6 +269,12 @@ def test_saving_does_not_touch_gradients_or_precision(tmp_path: Path) -> None:
     assert field.means.requires_grad
 
 
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        random_field().save_ply(tmp_path / "missing/field.ply")
+    assert caught.value.filename == str(tmp_path / "missing")
+
+
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     field = random_field(3, 0)
     field.save_ply(tmp_path / "f.ply")

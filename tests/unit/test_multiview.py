@@ -89,6 +89,11 @@ def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_ar
     torch.testing.assert_close(found.blame.double(), expected, rtol=2e-5, atol=1e-6)
 
 
+def test_a_field_without_gaussians_has_no_scores() -> None:
+    found = view_scores(iter(()), torch.zeros(0, 1, 3, requires_grad=True), 0.1)
+    assert found.pixels.shape == found.blame.shape == (0,)
+
+
 def rendered(by_centre: Tensor, by_absolute: Tensor) -> RenderResult:
     """Return a render after `backward()`, its gradients in normalised device coordinates along x."""
     scale = torch.tensor([2 / CAMERA.width, 0.0])

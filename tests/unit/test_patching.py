@@ -30,6 +30,7 @@ from lapgs_plugin.patching.files import read_only, uncommitted, write_all
 from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
 from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
+from tests.folders import snapshot
 
 # An anchor is written between [name and name], so that its index among the tokens is known.
 PROGRAMS = {
@@ -164,18 +165,14 @@ def write_tree(root: Path, tree: dict[str, bytes]) -> Target:
     return Target(RECIPE, root)
 
 
-def read_tree(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def apply(target: Target, *sets: str) -> dict[str, bytes]:
     write_all(plan_apply(target, sets))
-    return read_tree(target.folder)
+    return snapshot(target.folder)
 
 
 def revert(target: Target, *sets: str) -> dict[str, bytes]:
     write_all(plan_revert(target, sets))
-    return read_tree(target.folder)
+    return snapshot(target.folder)
 
 
 def bare(data: bytes) -> str:
@@ -237,7 +234,7 @@ def test_a_tree_without_any_one_anchor_is_refused_and_untouched(root: Path, data
     target = write_tree(root, broken)
     with pytest.raises(PatchError, match=rf"{file}:\d+: expected `.*` once .*but found it nowhere"):
         plan_apply(target, [ALL_SETS])
-    assert read_tree(root) == broken
+    assert snapshot(root) == broken
     impossible = {found.set for found in status(target) if found.state is State.IMPOSSIBLE}
     assert impossible == {EDITS[name].set if name in EDITS else CHECK.set}
 
@@ -391,9 +388,9 @@ def test_a_set_that_is_opt_in_goes_in_by_name_only_and_out_with_all(target: Targ
     }
     apply(chosen, "build")
     assert {found.state for found in status(chosen)} == {State.APPLIED}
-    after = read_tree(target.folder)
+    after = snapshot(target.folder)
     apply(chosen, ALL_SETS)
-    assert read_tree(target.folder) == after
+    assert snapshot(target.folder) == after
     assert revert(chosen, ALL_SETS) == tree
 
 
@@ -431,7 +428,7 @@ def test_a_write_that_fails_leaves_every_file_as_it_was(
     monkeypatch.setattr(Path, "replace", fail_once)
     with pytest.raises(PatchError if isinstance(error, OSError) else KeyboardInterrupt):
         write_all(changes)
-    assert read_tree(target.folder) == tree
+    assert snapshot(target.folder) == tree
 
 
 def test_a_file_changed_meanwhile_is_not_overwritten(target: Target, tree: dict[str, bytes]) -> None:
@@ -439,7 +436,7 @@ def test_a_file_changed_meanwhile_is_not_overwritten(target: Target, tree: dict[
     (target.folder / "kernels/host.h").write_bytes(b"new")
     with pytest.raises(PatchError, match="changed by another program"):
         write_all(changes)
-    assert read_tree(target.folder) == {**tree, "kernels/host.h": b"new"}
+    assert snapshot(target.folder) == {**tree, "kernels/host.h": b"new"}
 
 
 def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
@@ -560,9 +557,9 @@ for command in planners:
 def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: Path, tmp_path: Path) -> None:
     checkout = rasterizer.parents[1]
     (rasterizer / "cuda_rasterizer/.forward.cu.notes.lapgs").write_text("mine")  # not a temporary file of ours
-    before = read_tree(checkout)
+    before = snapshot(checkout)
     write_all(plan_apply(find_targets(checkout)[0], [ALL_SETS]))
-    after = read_tree(checkout)
+    after = snapshot(checkout)
     lapgs_patch("revert", checkout)
     copies = tmp_path / "copies"
     copies.mkdir()
@@ -572,17 +569,17 @@ def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: 
     assert len(found) >= 2 * (4 * 5 + 1)
     left = 0
     for number, copy in enumerate(found):
-        tree = read_tree(copy)
+        tree = snapshot(copy)
         temporaries = tree.keys() - before.keys()
         assert all(re.fullmatch(r"\..*\.[a-z0-9_]{8}\.lapgs", Path(name).name) for name in temporaries)
         assert all(tree[name] in (before[name], after[name]) for name in before)
         left += bool(temporaries)
         lapgs_patch(("status", "apply", "revert")[number % 3], copy)
-        assert read_tree(copy).keys() == before.keys()
+        assert snapshot(copy).keys() == before.keys()
         lapgs_patch("apply", copy)
-        assert read_tree(copy) == after
+        assert snapshot(copy) == after
         lapgs_patch("revert", copy)
-        assert read_tree(copy) == before
+        assert snapshot(copy) == before
     assert left > len(found) // 2, "most of these deaths leave something"
 
 
@@ -591,7 +588,7 @@ def test_temporary_files_of_a_process_that_lives_stay(rasterizer: Path, monkeypa
     folder = rasterizer / "cuda_rasterizer"
     theirs = folder / ".forward.cu.abcd_123.lapgs"
     theirs.write_text("half")
-    before = read_tree(rasterizer)
+    before = snapshot(rasterizer)
     program = "import fcntl, os, sys; fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), 2); print('has it', flush=True); "
     with subprocess.Popen(
         [sys.executable, "-c", f"{program}sys.stdin.read()", str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -602,7 +599,7 @@ def test_temporary_files_of_a_process_that_lives_stay(rasterizer: Path, monkeypa
         for command in ("status", "apply", "revert"):
             with pytest.raises(PatchError, match="cuda_rasterizer: another `lapgs patch` works on it; wait"):
                 lapgs_patch(command, rasterizer)
-        assert read_tree(rasterizer) == before
+        assert snapshot(rasterizer) == before
         other.kill()
     lapgs_patch("status", rasterizer)
     assert not theirs.exists()
@@ -825,7 +822,7 @@ def test_a_rasterizer_where_something_else_reads_the_degree_is_refused(rasterize
 def test_a_header_that_the_source_has_is_not_included_again(rasterizer: Path, has: str, needed: bool) -> None:
     path = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
     path.write_text(has + path.read_text())
-    before = read_tree(rasterizer)
+    before = snapshot(rasterizer)
     (target,) = find_targets(rasterizer)
     states = {found.set: found.state for found in status(target)}
     assert states["build-cuda13"] is (State.NOT_APPLIED if needed else State.NOT_NEEDED)
@@ -856,7 +853,7 @@ def test_float_limits_are_included_once(tmp_path: Path, recipe: str) -> None:
 def test_a_header_included_twice_by_an_earlier_version_is_taken_out(rasterizer: Path) -> None:
     path = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
     path.write_text("#include <cstdint>\n" + path.read_text())
-    before = read_tree(rasterizer)
+    before = snapshot(rasterizer)
     (target,) = find_targets(rasterizer)
     edits = tuple(replace(edit, unless=()) for edit in target.recipe.edits)
     older = replace(target, recipe=replace(target.recipe, edits=edits))
@@ -943,14 +940,14 @@ def lapgs_patch(*arguments: str | Path) -> str:
 
 def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     checkout = rasterizer.parents[1]
-    pristine = read_tree(checkout)
+    pristine = snapshot(checkout)
     assert re.search(r"signed-color +not applied\n +build-cuda13 +not applied", lapgs_patch("status", checkout))
     diff = lapgs_patch("diff", checkout, "--set", "build-cuda13")
     assert re.findall(r"^[+-].*", diff, re.MULTILINE)[:3:2] == [
         "--- a/submodules/diff-gaussian-rasterization/cuda_rasterizer/rasterizer_impl.h",
         "+// >>> lapgs build-cuda13/cstdint " + diff.split("build-cuda13/cstdint ")[1][:8],
     ]
-    assert read_tree(checkout) == pristine
+    assert snapshot(checkout) == pristine
     output = lapgs_patch("apply", checkout)
     assert output.endswith(f"reinstall the changed extensions:\n  pip install --no-build-isolation {rasterizer}\n")
     assert re.search(r"signed-color +applied\n +build-cuda13 +applied", lapgs_patch("status", checkout))
@@ -959,7 +956,7 @@ def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     lapgs_patch("revert", checkout, "--set", "signed-color")
     assert re.search(r"signed-color +not applied\n +build-cuda13 +applied", lapgs_patch("status", checkout))
     lapgs_patch("revert", checkout)
-    assert read_tree(checkout) == pristine
+    assert snapshot(checkout) == pristine
     assert "nothing to remove" in lapgs_patch("revert", checkout)
 
 
@@ -971,7 +968,7 @@ def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:
     git(rasterizer, "commit", "-m", "all")
     path = rasterizer / "cuda_rasterizer/forward.cu"
     path.write_text("// mine\n" + path.read_text())
-    before = read_tree(rasterizer / "cuda_rasterizer")
+    before = snapshot(rasterizer / "cuda_rasterizer")
     with pytest.raises(PatchError, match=rf"uncommitted changes in {re.escape(str(path))}; commit them"):
         lapgs_patch("apply", rasterizer)
     assert f"uncommitted changes: {path}" in lapgs_patch("status", rasterizer)
@@ -980,11 +977,11 @@ def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:
         with pytest.raises(PatchError, match=rf"read-only: {re.escape(str(path))}"):
             lapgs_patch(*command.split(), rasterizer)
     assert f"read-only: {path}" in lapgs_patch("status", rasterizer)
-    assert read_tree(rasterizer / "cuda_rasterizer") == before
+    assert snapshot(rasterizer / "cuda_rasterizer") == before
     path.chmod(0o644)
     lapgs_patch("apply", "--allow-dirty", rasterizer)
     lapgs_patch("revert", rasterizer)
-    assert read_tree(rasterizer / "cuda_rasterizer") == before
+    assert snapshot(rasterizer / "cuda_rasterizer") == before
 
 
 def test_nothing_is_imported_for_the_help() -> None:
@@ -1013,7 +1010,7 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             for path in copy.rglob("*.[ch]*"):
                 if ending is not None:
                     path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", ending))
-            before = read_tree(copy)
+            before = snapshot(copy)
             (target,) = find_targets(copy)
             assert target.recipe.name == upstream.recipe.name
             after = apply(target, *target.recipe.sets)

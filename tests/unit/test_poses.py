@@ -31,11 +31,9 @@ from lapgs_plugin.training.checkpoint import TransformsState, check_transforms
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
+from tests.gsplat_on_cpu import GsplatOnCpu
 from tests.training_runs import StopAt, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
-from tests.unit.test_views_per_step import GsplatOnCpu, kernels
-
-__all__ = ["kernels"]
 
 CORRECTION = (0.03, -0.05, 0.02, 0.1, -0.05, 0.03)
 
@@ -99,7 +97,7 @@ def gradient_by_pose(rasterizer: Rasterizer, device: str = "cpu") -> Tensor:
     return movement.grad.cpu()
 
 
-@pytest.mark.usefixtures("kernels")
+@pytest.mark.usefixtures("gsplat_kernels")
 @pytest.mark.parametrize("direct", [False, True])
 def test_gradient_by_a_pose_through_gsplat_is_that_of_the_oracle(direct: bool) -> None:
     expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))

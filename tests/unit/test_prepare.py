@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import sqlite3
@@ -35,6 +34,7 @@ from lapgs_plugin.scenes.prepare.writing import move_into_place
 from lapgs_plugin.scenes.sample.raycast import render
 from lapgs_plugin.scenes.sample.solids import ball, box, rod
 from lapgs_plugin.scenes.sample.world import PALETTE
+from tests.folders import snapshot
 
 SIZE, WIDE = (288, 192), (336, 228)
 """Of the photos, and of images that hold all that a bent lens sees."""
@@ -137,11 +137,6 @@ def _centre_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     return np.linalg.norm(_align(found, target) - target, axis=1) / 4.6
 
 
-def _hashes(folder: Path) -> dict[str, str]:
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-
-
 def test_cameras_are_recovered_up_to_a_similarity(prepared: tuple[Path, PrepareResult]) -> None:
     out, result = prepared
     assert len(result.registered) == COUNT
@@ -242,7 +237,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     monkeypatch.setattr(pipeline, "move_into_place", listed_then_moved)
     prepare_scene(photos, out, progress=False)
     assert "kept" in tables, "it started over"
-    assert _hashes(out) == _hashes(prepared[0])
+    assert snapshot(out) == snapshot(prepared[0])
 
 
 @pytest.mark.parametrize("done", range(4))
@@ -315,7 +310,7 @@ def test_photos_of_nothing_in_common_are_an_error_and_a_scene_that_is_there_stay
     assert compared == 13 + 12 + 10 + 6  # 1, 2, 4 and 8 photos ahead
     assert colmap._neighbour_pairs(14) == compared  # what the progress bar counts to
     shutil.rmtree(out / ".prepare")
-    assert _hashes(out) == _hashes(prepared[0])
+    assert snapshot(out) == snapshot(prepared[0])
 
 
 def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
@@ -352,11 +347,11 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
 
 
 def test_folders_inside_each_other_are_refused(noise: Path) -> None:
-    before = _hashes(noise.parent)
+    before = snapshot(noise.parent)
     for photos, out in ((noise, noise / "scene"), (noise, noise.parent), (noise, noise)):
         with pytest.raises(UserInputError, match="lies in the other"):
             prepare_scene(photos, out, overwrite=True, progress=False)
-    assert _hashes(noise.parent) == before
+    assert snapshot(noise.parent) == before
 
 
 def test_a_full_disk_is_one_line(few: Path, tmp_path: Path) -> None:

@@ -148,8 +148,12 @@ def test_a_loop_that_forgets_what_is_finished_damages_nothing(tmp_path: Path) ->
             archive.finish_level(lapgs.LevelRecord.of(plan[0], field), field)
         with pytest.raises(FieldError, match=r"level 0 has 9 Gaussians, its record says 8"):
             archive.finish_level(replace(lapgs.LevelRecord.of(plan[0], residual), num_gaussians=8), residual)
-        with pytest.raises(UserInputError, match="without iteration"):
+        with pytest.raises(UserInputError, match="it lacks iteration"):
             archive.append_history({"level": 0, "loss": 1.0})
+        with pytest.raises(UserInputError, match="holds the Tensor"):
+            archive.append_history({"level": 0, "iteration": 1, "loss": torch.ones(())})
+        with pytest.raises(UserInputError, match=r"num_gaussians is 2\.5"):
+            archive.append_history({"level": 0, "iteration": 1, "num_gaussians": 2.5})
         with pytest.raises(UserInputError, match="expected finite numbers"):
             archive.append_history({"level": 0, "iteration": 1, "loss": float("nan")})
     assert torch.equal(lapgs.RunArchive.open(tmp_path / "run").field(1).means, field.means)

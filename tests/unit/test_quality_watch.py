@@ -186,9 +186,11 @@ def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happe
     assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
 
 
-def test_keep_best_needs_views_to_set_aside() -> None:
+def test_keep_best_needs_views_to_set_aside(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 6 of them, expected at least 12"):
         make_plan((56, 40), TrainSettings(keep="best"), 6)
+    with pytest.raises(UserInputError, match=r"--keep best: .* the scene has 1 of them, expected at least 12"):
+        train(tmp_path / "run", ring_scene(train=1, test=0), TrainSettings(keep="best"))
     with pytest.raises(UserInputError, match="--keep first: expected last or best"):
         TrainSettings(keep="first")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from lapgs_plugin.scenes.sample.points import NOISE
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
 from lapgs_plugin.scenes.sample.world import build_world
+from tests.folders import snapshot
 
 SMALL = {"width": 48, "height": 32, "views": 3, "points": 40, "progress": False}
 WIDTH, HEIGHT = 240, 160
@@ -185,16 +185,11 @@ def test_images_have_energy_at_high_frequencies(pictures: dict[str, NDArray[np.f
     assert min(shares) > 0.07  # seen: 0.13 to 0.35
 
 
-def _hashes(folder: Path) -> dict[str, str]:
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-
-
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     make_sample_scene(tmp_path / "a", **SMALL)
     make_sample_scene(tmp_path / "b", **SMALL)
     make_sample_scene(tmp_path / "c", **SMALL, seed=1)
-    first, second, other = (_hashes(tmp_path / name) for name in "abc")
+    first, second, other = (snapshot(tmp_path / name) for name in "abc")
     assert first == second
     assert len(first) >= 6
     assert all(first[name] != other[name] for name in first if name.startswith("images"))
@@ -203,7 +198,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_fewer_views_are_the_first_of_more(tmp_path: Path) -> None:
     make_sample_scene(tmp_path / "few", **SMALL)
     make_sample_scene(tmp_path / "more", **{**SMALL, "views": 5})
-    few, more = _hashes(tmp_path / "few"), _hashes(tmp_path / "more")
+    few, more = snapshot(tmp_path / "few"), snapshot(tmp_path / "more")
     assert [few[f"images/{view:04d}.png"] for view in range(3)] == [more[f"images/{view:04d}.png"] for view in range(3)]
 
 
@@ -333,12 +328,12 @@ def test_arguments_out_of_range_are_refused(tmp_path: Path, change: dict[str, in
 def test_a_folder_with_anything_in_it_is_refused(tmp_path: Path) -> None:
     scene, file = tmp_path / "scene", tmp_path / "file"
     make_sample_scene(scene, **SMALL)
-    before = _hashes(scene)
+    before = snapshot(scene)
     with pytest.raises(UserInputError, match="--overwrite"):
         make_sample_scene(scene, **SMALL, seed=1)
-    assert _hashes(scene) == before
+    assert snapshot(scene) == before
     make_sample_scene(scene, **SMALL, seed=1, overwrite=True)
-    assert _hashes(scene) != before
+    assert snapshot(scene) != before
     (scene / "thesis.txt").write_text("years of work")
     with pytest.raises(UserInputError, match="holds thesis"):
         make_sample_scene(scene, **SMALL, overwrite=True)
@@ -352,7 +347,7 @@ def test_a_folder_with_anything_in_it_is_refused(tmp_path: Path) -> None:
 def test_an_interruption_leaves_the_old_scene_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tmp_path / "scene"
     make_sample_scene(scene, **SMALL)
-    before = _hashes(scene)
+    before = snapshot(scene)
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -360,7 +355,7 @@ def test_an_interruption_leaves_the_old_scene_and_nothing_else(tmp_path: Path, m
     monkeypatch.setattr(scene_module, "sample_points", interrupt)
     with pytest.raises(KeyboardInterrupt):
         make_sample_scene(scene, **SMALL, seed=1, overwrite=True)
-    assert _hashes(scene) == before
+    assert snapshot(scene) == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["scene"]
 
 

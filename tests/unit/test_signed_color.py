@@ -44,15 +44,6 @@ ORACLE = OracleRasterizer()
 CONSTANT = 0.28209479177387814  # the first basis function
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_torch_thread() -> Iterator[None]:
-    """Use one thread: the tensors are small, and a second OpenMP thread would only spin."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 class Unpatched:
     """An unpatched extension: it takes a negative degree for one below 1, and clamps colours."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
-from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
+from tests.gsplat_on_cpu import GsplatOnCpu
 from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
@@ -110,27 +110,11 @@ def scene() -> Scene:
 # ------------------------------------------------------------------------------------------------------------ gsplat
 
 
-class GsplatOnCpu(GsplatRasterizer):
-    """Call gsplat's functions or, `direct`, its kernels."""
-
-    can_batch = True
-
-    def __init__(self, direct: bool, **options: Any) -> None:
-        super().__init__("cpu", **options)
-        self._may_be_direct = self._must_be_direct = direct
-
-
 def leaves(field: GaussianField) -> GaussianField:
     return field.with_parameters({name: value.clone().requires_grad_() for name, value in field.parameters.items()})
 
 
-@pytest.fixture
-def kernels() -> Iterator[None]:
-    with gsplat_on_cpu(), direct_on_cpu():
-        yield
-
-
-@pytest.mark.usefixtures("kernels")
+@pytest.mark.usefixtures("gsplat_kernels")
 @pytest.mark.parametrize("direct", [False, True])
 @pytest.mark.parametrize(("signed", "own_radii"), [(False, True), (True, False)])
 def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: bool) -> None:
@@ -176,7 +160,7 @@ def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: b
     empty.image.sum().backward()
 
 
-@pytest.mark.usefixtures("kernels")
+@pytest.mark.usefixtures("gsplat_kernels")
 def test_a_camera_that_inference_mode_saw_first_can_be_trained_on() -> None:
     rasterizer, field = GsplatOnCpu(True), leaves(blob_field(20))
     with torch.inference_mode():

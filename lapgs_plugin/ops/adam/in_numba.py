@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.jit.compiler import inline, jit
-from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, at, fetch_add, load, sqrt, store
+from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, fetch_add, load, sqrt, store
 from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS
 
@@ -27,14 +27,14 @@ Value = TypeVar("Value", Lanes, float)
 @inline
 def _moments(gradient: Value, mean: Value, square: Value, rates: Floats) -> tuple[Value, Value]:
     """Return both moments after this step."""
-    blend, decay, square_blend = at(rates, 0), at(rates, 1), at(rates, 2)
+    blend, decay, square_blend = rates[0], rates[1], rates[2]
     return mean + blend * (gradient - mean), decay * square + square_blend * (gradient * gradient)
 
 
 @inline
 def _moved(parameter: Value, scale: Value, mean: Value, root: Value, rates: Floats) -> Value:
     """Return the parameter after this step; `root` is the square root of the second moment."""
-    step_size, correction, eps = at(rates, 3), at(rates, 4), at(rates, 5)
+    step_size, correction, eps = rates[3], rates[4], rates[5]
     moved: Value = parameter - step_size * scale * mean / (correction * root + eps)
     return moved
 
@@ -66,8 +66,8 @@ def _adam_kernel(
                 store(p, i, _moved(load(p, i), load(scale, x), mean, sqrt(square), rates))
             for x in range(whole, count):
                 i = start + x
-                m[i], v[i] = _moments(at(g, i), at(m, i), at(v, i), rates)
-                p[i] = _moved(at(p, i), at(scale, x), at(m, i), np.sqrt(at(v, i)), rates)
+                m[i], v[i] = _moments(g[i], m[i], v[i], rates)
+                p[i] = _moved(p[i], scale[x], m[i], np.sqrt(v[i]), rates)
 
 
 class FieldAdam(torch.optim.Optimizer):

@@ -20,13 +20,11 @@ from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
-    at,
     borrowed,
     fetch_add,
     fma,
     keep_alive,
     load,
-    put,
     splat,
     store,
     store_columns,
@@ -66,7 +64,7 @@ def _upsample_row(
 ) -> None:
     """Upsample a row of `length` coarse samples; `row` is scratch space for them and their neighbours."""
     for x in range(length):
-        put(row, BEFORE + x, at(coarse, start + x))
+        row[BEFORE + x] = coarse[start + x]
     for i in range(0, pitch, WIDTH):
         even = odd = splat(row, 0.0)
         for k in range(NEIGHBOURS):
@@ -110,13 +108,13 @@ def _kernel(
             for x in range(0, whole, WIDTH):
                 total = load(above, place + x) if adds else splat(above, 0.0)
                 for tap in range(taps):
-                    total = fma(load(upsampled, first + tap * wide + x), at(down, y * taps + tap), total)
+                    total = fma(load(upsampled, first + tap * wide + x), down[y * taps + tap], total)
                 store(result, place + x, total)
             for x in range(whole, width):
-                rest = at(above, place + x) if adds else fine.dtype.type(0)
+                rest = above[place + x] if adds else fine.dtype.type(0)
                 for tap in range(taps):
-                    rest += at(upsampled, first + tap * wide + x) * at(down, y * taps + tap)
-                put(result, place + x, rest)
+                    rest += upsampled[first + tap * wide + x] * down[y * taps + tap]
+                result[place + x] = rest
     keep_alive(memory)
     keep_alive(padded)
 

@@ -12,8 +12,7 @@ from lapgs_plugin.jit.compiler import jit
 from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
-    at,
-    broadcast,
+    borrowed,
     exp2,
     fetch_add,
     fma,
@@ -93,10 +92,12 @@ def _accumulate(
 ) -> None:
     """Sum up each splat in each tile; alpha has the bits of `tile_kernels.blend`."""
     transmittance, weight = np.empty(TILE_PIXELS, splats.dtype), np.zeros(TILE_PIXELS, splats.dtype)
-    none, one = splat(splats, 0.0), splat(splats, 1.0)
+    none, one, tiles = splat(splats, 0.0), splat(splats, 1.0), reached.size
+    tile_start, members, hits, reached = borrowed(tile_start), borrowed(members), borrowed(hits), borrowed(reached)
+    splats, weights = borrowed(splats), borrowed(weights)
     while True:
         tile = fetch_add(counter, 1)
-        if tile >= reached.size:
+        if tile >= tiles:
             break
         tile_y, tile_x = divmod(tile, tiles_x)
         for block in range(BLOCKS):
@@ -106,20 +107,20 @@ def _accumulate(
             for row in range(min(BLOCK, height - first_y)):
                 for column in range(min(BLOCK, width - first_x)):
                     pixel = (first_y + row) * width + first_x + column
-                    weight[block * WIDTH + row * BLOCK + column] = at(weights, pixel)
-        start = at(tile_start, tile)
-        for pair in range(start + at(reached, tile), at(tile_start, tile + 1)):
+                    weight[block * WIDTH + row * BLOCK + column] = weights[pixel]
+        start = tile_start[tile]
+        for pair in range(start + reached[tile], tile_start[tile + 1]):
             store(slots, pair * SLOT, none)
-        for pair in range(start, start + at(reached, tile)):
-            s = int(at(members, pair)) * SPLAT
+        for pair in range(start, start + reached[tile]):
+            s = int(members[pair]) * SPLAT
             position = splat(splats, float(pair - start + 1))
             sum_weight, sum_one, sum_share, sum_distance = none, none, none, none
-            blocks = int(at(hits, pair))
+            blocks = int(hits[pair])
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1
-                dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
-                dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
+                dx = pixels_x(offsets, block, tile_x) - splats[s + CENTRE_X]
+                dy = pixels_y(offsets, block, tile_y) - splats[s + CENTRE_Y]
                 _, _, exponent = falloff(splats, s, dx, dy)
                 alpha = minimum(exp2(exponent), MAX_ALPHA)
                 last = load(final, tile * FINAL + (2 * block + 1) * WIDTH)
