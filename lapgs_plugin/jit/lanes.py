@@ -77,11 +77,6 @@ def load(array: Floats, start: int) -> Lanes:
     _compiled_only()
 
 
-def broadcast(array: Floats, index: int) -> Lanes:
-    """Load array[index] into each lane."""
-    _compiled_only()
-
-
 def prefetch(array: NDArray[Any], index: int) -> None:
     """Prefetch the cache line of array[index], which may be out of range."""
     _compiled_only()

@@ -334,11 +334,6 @@ def _lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-def _lower_broadcast(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    element = sig.return_type.element
-    return _widen(context, builder, builder.load(_place(context, builder, sig, args)), element, element)
-
-
 def _lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     byte = ir.IntType(8).as_pointer()
     function_type = ir.FunctionType(ir.VoidType(), [byte, _INT32, _INT32, _INT32])
@@ -359,7 +354,6 @@ def _type_vector(array: Any, number: Any) -> Any:
 _register(lanes.borrowed, lambda a: types.CPointer(a.dtype) if _is_memory(a) else None, _lower_borrowed)
 _register(lanes.keep_alive, lambda array: types.void, lambda context, *_: context.get_dummy_value())
 _register(lanes.load, _type_vector, _load_part)
-_register(lanes.broadcast, _type_vector, _lower_broadcast)
 _register(lanes.splat, _type_vector, _lower_splat)
 _register(lanes.store, _type_store, _lower_store)
 _register(lanes.prefetch, lambda array, index: types.void if _is_memory(array) else None, _lower_prefetch)

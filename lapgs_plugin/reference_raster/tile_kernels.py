@@ -25,7 +25,6 @@ from lapgs_plugin.jit.lanes import (
     any_lane,
     bits,
     borrowed,
-    broadcast,
     exp2,
     fetch_add,
     fma,
@@ -119,13 +118,13 @@ def _blocks_reached(splats: Floats, s: int, left: Lanes, top: Lanes) -> int:
     Args:
         left, top: pixel coordinates of the blocks' first pixels.
     """
-    x0, y0 = left - broadcast(splats, s + CENTRE_X), top - broadcast(splats, s + CENTRE_Y)
+    x0, y0 = left - splats[s + CENTRE_X], top - splats[s + CENTRE_Y]
     x1, y1 = x0 + (BLOCK - 1.0), y0 + (BLOCK - 1.0)
     near_x, near_y = minimum(maximum(x0, 0.0), x1), minimum(maximum(y0, 0.0), y1)
-    best_x = minimum(maximum(near_y * broadcast(splats, s + RIDGE_X), x0), x1)
-    best_y = minimum(maximum(near_x * broadcast(splats, s + RIDGE_Y), y0), y1)
+    best_x = minimum(maximum(near_y * splats[s + RIDGE_X], x0), x1)
+    best_y = minimum(maximum(near_x * splats[s + RIDGE_Y], y0), y1)
     least = minimum(_distance(splats, s, near_x, best_y), _distance(splats, s, best_x, near_y))
-    return bits(least <= broadcast(splats, s + REACH))
+    return bits(least <= splats[s + REACH])
 
 
 @inline
@@ -138,9 +137,9 @@ def _distance(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> Lanes:
 @inline
 def falloff(splats: Floats, s: int, dx: Lanes, dy: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Return u, v, and the logarithm of alpha before the cap, to base 2, at offsets from a splat's centre."""
-    u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * broadcast(splats, s + FACTOR_XY))
-    v = dy * broadcast(splats, s + FACTOR_YY)
-    return u, v, fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+    u = fma(dx, splats[s + FACTOR_XX], dy * splats[s + FACTOR_XY])
+    v = dy * splats[s + FACTOR_YY]
+    return u, v, fma(-u, u, fma(-v, v, splats[s + LOG2_OPACITY]))
 
 
 # ------------------------------------------------------------------------------------------------ forward
@@ -263,16 +262,16 @@ def _blend_block(
     for j in range(counts[block]):
         pair = lists[block * BATCH + j]
         s = members[pair] * SPLAT
-        dx, dy = x - broadcast(splats, s + CENTRE_X), y - broadcast(splats, s + CENTRE_Y)
+        dx, dy = x - splats[s + CENTRE_X], y - splats[s + CENTRE_Y]
         _, _, exponent = falloff(splats, s, dx, dy)
         alpha = minimum(exp2(exponent), MAX_ALPHA)
         visible = exponent >= LOG2_MIN_ALPHA
         behind = fma(-alpha, t, t)
         blended = visible & (behind >= MIN_TRANSMITTANCE)
         weight = select(blended, alpha * t, 0.0)
-        red = fma(weight, broadcast(splats, s + RED), red)
-        green = fma(weight, broadcast(splats, s + GREEN), green)
-        blue = fma(weight, broadcast(splats, s + BLUE), blue)
+        red = fma(weight, splats[s + RED], red)
+        green = fma(weight, splats[s + GREEN], green)
+        blue = fma(weight, splats[s + BLUE], blue)
         last = select(blended, splat(splats, pair - start + 1), last)
         t = select(blended, behind, select(visible, minimum(t, -t), t))
         if not any_lane(t > 0.0):
@@ -409,7 +408,7 @@ def _splat_backward(
     T c - R / (1 - alpha). In front of the splat, R is larger by alpha T c.
     """
     s = members[pair] * SPLAT
-    xy, yy = broadcast(splats, s + FACTOR_XY), broadcast(splats, s + FACTOR_YY)
+    xy, yy = splats[s + FACTOR_XY], splats[s + FACTOR_YY]
     position = splat(splats, pair - start + 1)
     none = splat(splats, 0.0)
     sum_red, sum_green, sum_blue = none, none, none
@@ -420,11 +419,11 @@ def _splat_backward(
         blocks &= blocks - 1
         place = _BACKWARD * block * WIDTH
         # As `falloff`, with xy and yy in registers. The others are loaded again in each block; they would be spilled.
-        dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
-        dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
-        u = fma(dx, broadcast(splats, s + FACTOR_XX), dy * xy)
+        dx = pixels_x(offsets, block, tile_x) - splats[s + CENTRE_X]
+        dy = pixels_y(offsets, block, tile_y) - splats[s + CENTRE_Y]
+        u = fma(dx, splats[s + FACTOR_XX], dy * xy)
         v = dy * yy
-        exponent = fma(-u, u, fma(-v, v, broadcast(splats, s + LOG2_OPACITY)))
+        exponent = fma(-u, u, fma(-v, v, splats[s + LOG2_OPACITY]))
         density = exp2(exponent)
         alpha = minimum(density, MAX_ALPHA)
         blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, place + _FINAL * WIDTH) >= position)
@@ -436,8 +435,8 @@ def _splat_backward(
         )
         inverse = select(blended, 1.0 / (1.0 - alpha), 1.0)
         in_front = t * inverse
-        shade = grad_blue * broadcast(splats, s + BLUE)
-        shade = fma(grad_red, broadcast(splats, s + RED), fma(grad_green, broadcast(splats, s + GREEN), shade))
+        shade = grad_blue * splats[s + BLUE]
+        shade = fma(grad_red, splats[s + RED], fma(grad_green, splats[s + GREEN], shade))
         weight = select(blended, alpha * in_front, 0.0)
         store(state, place + _T_BEHIND * WIDTH, in_front)
         store(state, place + _REST * WIDTH, fma(weight, shade, rest))

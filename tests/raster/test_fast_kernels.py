@@ -72,7 +72,7 @@ def rearranged(a: Floats, out: Floats, whole: NDArray[np.int32]) -> None:
     lanes.store_whole(whole, 0, three[0], three[2])
     there, here = lanes.borrowed(out), lanes.borrowed(a)
     there[700] = here[7]
-    lanes.store(there, 701, lanes.broadcast(here, 9))
+    lanes.store(there, 701, lanes.splat(here, here[9]))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -349,6 +349,7 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
             "--residual-threshold with --strategy mcmc",
         ),
         ({"hierarchy": "laplacian", "residual_threshold": 0.0}, "--residual-threshold 0"),
+        ({"coarse_threshold": 0.0}, "--coarse-threshold 0.0: expected a positive factor"),
         ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
         (
             {"densification": Densification(strategy="3dgs", options=Gradients(grow_grad2d=-1.0))},

@@ -35,7 +35,8 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WIDTH, HEIGHT = 800, 600
+WIDTH, HEIGHT = 800, 440
+"""Of the window: no narrower, or the panel covers the divider; no higher, since the browser draws in software."""
 PATIENCE = 90.0
 """Seconds to wait for steps that take two; the browser renders in software on a busy machine."""
 
@@ -91,12 +92,17 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
-@pytest.fixture
-def page(browser: Any, address: str) -> Iterator[Any]:
+def opened(browser: Any, address: str) -> Any:
     """Open the viewer's page and wait for its first picture at the window's size."""
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.goto(address)
     page.get_by_text(f"{WIDTH} x {HEIGHT} in").wait_for(timeout=1e3 * PATIENCE)
+    return page
+
+
+@pytest.fixture
+def page(browser: Any, address: str) -> Iterator[Any]:
+    page = opened(browser, address)
     yield page
     page.close()
 
@@ -178,9 +184,7 @@ def test_the_divider_is_dragged_in_the_picture(page: Any) -> None:
 
 
 def test_a_client_that_leaves_harms_nobody(page: Any, browser: Any, address: str) -> None:
-    other = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-    other.goto(address)
-    other.get_by_text(f"{WIDTH} x {HEIGHT} in").wait_for(timeout=1e3 * PATIENCE)
+    other = opened(browser, address)
     mine = wait_for(page, lambda image: image.std() > 5)
     other.get_by_label("split", exact=True).uncheck()
     wait_for(other, lambda image: difference(image, mine) > 0.5)

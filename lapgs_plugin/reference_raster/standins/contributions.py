@@ -13,7 +13,6 @@ from lapgs_plugin.jit.lanes import (
     WIDTH,
     Floats,
     borrowed,
-    broadcast,
     exp2,
     fetch_add,
     fma,
@@ -95,7 +94,7 @@ def _accumulate(
     transmittance, weight = np.empty(TILE_PIXELS, splats.dtype), np.zeros(TILE_PIXELS, splats.dtype)
     none, one, tiles = splat(splats, 0.0), splat(splats, 1.0), reached.size
     tile_start, members, hits, reached = borrowed(tile_start), borrowed(members), borrowed(hits), borrowed(reached)
-    weights = borrowed(weights)
+    splats, weights = borrowed(splats), borrowed(weights)
     while True:
         tile = fetch_add(counter, 1)
         if tile >= tiles:
@@ -120,8 +119,8 @@ def _accumulate(
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1
-                dx = pixels_x(offsets, block, tile_x) - broadcast(splats, s + CENTRE_X)
-                dy = pixels_y(offsets, block, tile_y) - broadcast(splats, s + CENTRE_Y)
+                dx = pixels_x(offsets, block, tile_x) - splats[s + CENTRE_X]
+                dy = pixels_y(offsets, block, tile_y) - splats[s + CENTRE_Y]
                 _, _, exponent = falloff(splats, s, dx, dy)
                 alpha = minimum(exp2(exponent), MAX_ALPHA)
                 last = load(final, tile * FINAL + (2 * block + 1) * WIDTH)
