@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder in which the programs run, with a scene."""
     monkeypatch.chdir(tmp_path)
     return write_scene(tmp_path / "data/mine")
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene whose coarser level can be trained at a quarter of its size."""
+    path = tmp_path_factory.mktemp("scenes") / "sample"
+    make_sample_scene(path, width=160, height=128, views=5, points=200, progress=False)
+    return path
 
 
 def executed(name: str, text: str | None = None) -> dict[str, Any]:
@@ -58,9 +67,11 @@ def test_a_run_is_merged(here: Path) -> None:
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
-def test_the_loop_trains_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hierarchy: str) -> None:
+def test_the_loop_trains_and_continues(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hierarchy: str
+) -> None:
     monkeypatch.chdir(tmp_path)
-    make_sample_scene(Path("data/mine"), width=160, height=128, views=5, points=200, progress=False)
+    shutil.copytree(sample, "data/mine")
     program = executed("my_loop.py", FILES["my_loop.py"].replace("% 500", "% 2"))
     rasterize, calls = program["rasterize"], []
 
