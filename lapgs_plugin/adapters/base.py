@@ -227,6 +227,7 @@ class BackboneAdapter:
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
+        call = self.call_of_residuals(call) if window.stage.signed else call
         copies = {role: copy.copy(call.values[name]) for role, name in call.roles.items()}
         dataset, opt, pipe = copies["dataset"], copies["opt"], copies.get("pipe", SimpleNamespace())
         parsed = {name: copy.copy(value) for name, value in call.values.items() if isinstance(value, Namespace)}
@@ -245,8 +246,6 @@ class BackboneAdapter:
         if window.stage.signed:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
             dataset.white_background = False
-            # The checkout's own conversion of SH in Python has no signed colour.
-            pipe.convert_SHs_python = False
             # A residual's opacity says where detail is missing, not where surfaces are.
             for options in (opt, *parsed.values()):
                 for name in _options(options, "depth", "weight"):
@@ -258,6 +257,13 @@ class BackboneAdapter:
         pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
         values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
         return call.changed(**values).listing(window.local)
+
+    def call_of_residuals(self, call: TrainingCall) -> TrainingCall:
+        """Return the call by which residuals are rendered."""
+        pipe = copy.copy(call.pipe)
+        # The checkout's own conversion of SH in Python has no signed colour.
+        pipe.convert_SHs_python = False
+        return call.changed(pipe=pipe)
 
     def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         """Return the symbols to replace besides those that the runner replaces in every backbone.

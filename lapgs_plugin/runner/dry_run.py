@@ -177,8 +177,7 @@ class DryRun:
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
-        # Options such as --convert_SHs_python are off in a residual's call.
-        call = self._call if path is None else self._scratch_call(Path(self._call.dataset.model_path))
+        call = self._call if path is None else self._adapter.call_of_residuals(self._call)
         image = self._context.render(rendering, call, view, gaussians, black=True)
         self._inputs = rendering.inputs
         return image
