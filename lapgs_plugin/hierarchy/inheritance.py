@@ -48,7 +48,7 @@ def field_from_points(points: Tensor, colors: Tensor, sh_degree: int) -> Gaussia
         UserInputError: no points, one is not finite, colours that are not one in [0, 1] for each point, or another
             degree.
     """
-    _require_degree(sh_degree)
+    require_degree(sh_degree)
     if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
         raise UserInputError(
             f"points {tuple(points.shape)} and colours {tuple(colors.shape)}: expected two tensors (n, 3)"
@@ -101,7 +101,7 @@ def inherit(
         raise UserInputError("the coarser level has no Gaussians left to inherit; train it longer or prune it less")
     kept = _sample_rows(len(field), ratio, generator).to(field.means.device)
     degree = field.sh_degree if sh_degree is None else sh_degree
-    _require_degree(degree)
+    require_degree(degree)
     rows = {name: tensor.detach()[kept] for name, tensor in field.parameters.items()}
     if mode == "full":
         if degree != field.sh_degree:
@@ -116,7 +116,8 @@ def inherit(
     return Inherited(_initial_field(rows["means"], sh, signed=True), kept)
 
 
-def _require_degree(sh_degree: int) -> None:
+def require_degree(sh_degree: int) -> None:
+    """Raise a UserInputError about an SH degree that is not 0 to 3."""
     if not 0 <= sh_degree <= 3:
         raise UserInputError(f"sh_degree {sh_degree}: expected 0 to 3")
 

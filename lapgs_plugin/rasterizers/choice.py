@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -122,8 +122,7 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     if name in owners:
         return _extension(name, owners[name].info.stand_in, device, settings)
     if name in package_rasterizers():
-        placed = package_rasterizer(name, device)
-        return PlacedRasterizer(placed.rasterizer, placed.device, settings)
+        return replace(package_rasterizer(name, device), unsupported=settings)
     raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*RASTERIZERS, *owners])}")
 
 

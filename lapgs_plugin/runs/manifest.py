@@ -14,6 +14,7 @@ from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST, require_manifest
+from lapgs_plugin.hierarchy.inheritance import require_degree
 from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Hierarchy, Stage
 from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.untrusted import STRICT, StrictWithMore, checked, read_json, shortened, usable_path
@@ -220,8 +221,7 @@ class Manifest:
             )
         if grid not in GRIDS:
             raise UserInputError(f"grid {grid}: expected {' or '.join(GRIDS)}")
-        if not 0 <= sh_degree <= 3:
-            raise UserInputError(f"sh_degree {sh_degree}: expected 0 to 3")
+        require_degree(sh_degree)
         settings = {"hierarchy": Hierarchy(hierarchy).value}
         return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings=settings)
 
