@@ -35,8 +35,9 @@ SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "eval", "seed", "rasterizer", "resume", "overwrite"),
     *("script", "arguments", "off", "record", "view", "view_port", "config"),
 }
-"""Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own. A settings file would hide what
-decides a result from the run's name."""
+"""Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own.
+
+A settings file would hide from a run's name what decides its result."""
 
 
 class RunsFailedError(LapgsError):
