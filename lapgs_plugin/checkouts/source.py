@@ -175,6 +175,17 @@ class CheckoutSource:
         known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
         return [name for name in names if name not in known]
 
+    def unpacks(self, function: str) -> bool:
+        """Return whether the checkout unpacks what a function of that name returns, or takes one of its results."""
+        for node in (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path))):
+            if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+                call = node.value if isinstance(node.slice.value, int) else None
+            else:
+                call = node.value if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) else None
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
+                return True
+        return False
+
     def own_package(self, package: str) -> OwnPackage | None:
         """Return the folder of the checkout that a package is installed from; None if there is none."""
         for setup in sorted([*self.root.glob("*/setup.py"), *self.root.glob("*/*/setup.py")]):

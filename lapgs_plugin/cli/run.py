@@ -130,6 +130,7 @@ def _execute(
     """Execute the script: with a hierarchy, or unchanged with --off."""
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
@@ -137,7 +138,9 @@ def _execute(
 
     on_device: AbstractContextManager[None] = nullcontext()
     if device == "cpu":
-        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, arguments))
+        variant = None if kind is None else kind.stand_in_for(root, arguments)
+        neighbours = kind is not None and CheckoutSource.read(script).unpacks("distCUDA2")
+        on_device = cuda_on_cpu(variant, neighbours=neighbours)
     try:
         with on_device, loaded_script(script, arguments) as loaded:
             if kind is None or (options.off and not options.record):
