@@ -154,6 +154,18 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
+    def hindrance(self, parameters: Iterable[str]) -> str | None:
+        """Return why no level can be trained; None if the sources do not say.
+
+        Args:
+            parameters: attributes of the model that a field is archived from.
+        """
+        if absent := self.unknown_attributes(parameters):
+            return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
+        if (several := self.image_scales) is not None:
+            return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
+        return None
+
     def unknown_attributes(self, names: Iterable[str]) -> list[str]:
         """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
         trees = [parsed_quietly(path) for path in self.modules.values()]

@@ -104,6 +104,8 @@ def run(
     path, words = require_script(script), arguments or []
     watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
     kind, root = _recognised(path, options.backbone, needed=not plain)
+    if kind is not None and not options.off:
+        _require_levels(path, kind)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
@@ -164,6 +166,18 @@ def _execute(
         if line is None:
             raise
         raise line from error
+
+
+def _require_levels(script: Path, kind: type[BackboneAdapter]) -> None:
+    """Refuse a checkout without levels by its sources, before its packages are missed.
+
+    Raises:
+        UserInputError: it cannot be trained in levels.
+    """
+    from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
+
+    if why := CheckoutSource.read(script).hindrance(kind.archived_parameters()):
+        raise UserInputError(f"{script} cannot be trained in levels: {why}; {OTHERWISE}")
 
 
 def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:
