@@ -23,7 +23,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, typed_line
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import Reconstructed, Supervision
@@ -249,7 +249,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
             hook = entry.load()()
         except Exception as error:  # any error of a plugin's code must name the plugin
             raise UserInputError(
-                f"hook {source} cannot be created: {type(error).__name__}: {error}; "
+                f"hook {source} cannot be created: {typed_line(error)}; "
                 "expected a StageHook class without arguments, fix or uninstall the package that brings it"
             ) from error
         verify_hook(hook, source)
