@@ -255,7 +255,7 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
 
 
-def test_doctor_says_that_a_model_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_model_that_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As of forks whose colours come from a network."""
     model = fork / "scene" / "gaussian_model.py"
     base, parameters = "class GaussianModel(GaussianBase):\n", ("_xyz", "_rotation", "_scaling", "_opacity")
@@ -267,7 +267,10 @@ def test_doctor_says_that_a_model_lacks_what_fields_have(fork: Path, capsys: pyt
     model.write_text(text.replace(base, roles), encoding="utf-8")
     lapgs("doctor", fork)
     shown = capsys.readouterr().out
-    assert len(re.findall(r"\(scene/gaussian_model.py:\d+\) have no _features_dc, _features_rest, from", shown)) == 2
+    why = r"\(scene/gaussian_model.py:\d+\) have no _features_dc, _features_rest, from"
+    assert len(re.findall(why, shown)) == 2
+    with pytest.raises(UserInputError, match=f"cannot be trained in levels: its Gaussians {why}.* --off"):
+        lapgs("run", "--device", "cpu", fork / "scripts" / "train.py")  # before packages, which would not help
 
 
 def test_doctor_says_that_images_of_several_sizes_have_no_levels(
