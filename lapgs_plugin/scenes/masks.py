@@ -40,11 +40,13 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
 
     The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder.
+    Other folders are not searched: a folder named by mistake may be a whole disk.
 
     Raises:
         SceneError: an image has no mask, or several.
     """
-    files = [file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES]
+    places = [place for parent in {PurePosixPath(name).parent for name in names} if is_folder(place := folder / parent)]
+    files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
     present: dict[str, list[Path]] = {}
     for file in sorted(files):  # cameras write .JPG, other programs .jpg
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
