@@ -60,13 +60,13 @@ class LapgsError(Exception):
     """An error that one line explains; the command line prints it and exits with `exit_code`.
 
     The message says what was wrong, the value received, what was expected and what to do next. It is always one
-    printable line.
+    printable line; an error about several mistakes has a line for each.
     """
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, message: str = "") -> None:
-        super().__init__(one_line(message))
+    def __init__(self, *lines: str) -> None:
+        super().__init__("\n".join(map(one_line, lines)))
 
 
 class UserInputError(LapgsError, ValueError):

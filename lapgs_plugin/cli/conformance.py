@@ -88,9 +88,9 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
 def _package_subject(name: str) -> Subject:
     """Return the rasterizer that an installed package brings."""
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers.choice import package_rasterizer
+    from lapgs_plugin.rasterizers.choice import placed_rasterizer
 
-    placed = package_rasterizer(name)
+    placed = placed_rasterizer(name)
     return Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)
 
 

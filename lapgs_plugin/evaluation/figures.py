@@ -20,12 +20,13 @@ from lapgs_plugin.ops.composition import Composition, to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.options import WHERE_TRAINED, RenderOptions
-from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.rendering.run import is_other_scene, run_renderer, run_scene
 from lapgs_plugin.rendering.speed import composed_speed
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest
 from lapgs_plugin.runs.neighbours import predicted_exposures
+from lapgs_plugin.runs.results import MEASURED
 from lapgs_plugin.runs.training_figures import training_figures
 from lapgs_plugin.scenes.scene import View
 
@@ -105,6 +106,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Measure a complete run on its held-out views, or on its training views when none were held out.
 
+    All views are measured of a scene that the run was not trained on.
+
     Show a progress bar and write the result to the run's metrics.json.
 
     Args:
@@ -125,6 +128,8 @@ def evaluate_run(
     with one_pool():
         scene = run_scene(archive, options.scene)
         split, views = ("test", scene.test) if scene.test else ("train", scene.train)
+        if options.scene is not None and is_other_scene(archive, scene):
+            split, views = "other", tuple(sorted((*scene.train, *scene.test), key=lambda view: view.name))
         smallest = min(min(view.camera.size) for view in views)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
         learned = archive.exposure(archive.available_levels[-1])
@@ -132,7 +137,7 @@ def evaluate_run(
         with item_progress("views") as progress:
             measured = [
                 measure_view(view, renderer.render(view.camera), renderer, distances, exposures.get(view.name))
-                for view in progress.track(views, description=f"Measuring {split} views")
+                for view in progress.track(views, description=f"Measuring {MEASURED[split]} views")
             ]
         speed = composed_speed(renderer, [view.camera for view in views[:FPS_VIEWS]], FPS_ROUNDS)
     metrics = {
@@ -195,7 +200,8 @@ def run_figures(manifest: Manifest, split: str, views: Sequence[ViewMetrics], ra
         exposure_predicted: whether they were measured with the exposure that neighbouring photos predict, see
             `predicted_exposures`; added by `evaluate_run`, absent in older files.
         masked: whether pixels outside of masks were left out; added by `evaluate_run`, absent in older files.
-        split, num_views: the measured views, "test" or "train", and their number.
+        split, num_views: the measured views, "test", "train" or "other" (of a scene that was not trained on), and their
+            number.
         train_seconds and other figures of training: see `training_figures`.
         levels: by level, psnr and upsampled_psnr (see `ViewMetrics`), iterations, image_size, train_seconds,
             num_gaussians, mean_gaussians, peak_gaussians, breakdown_seconds, gpu_busy_seconds, memory_bytes.

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lapgs_plugin.errors import RunFolderError, errors_about
+import torch
+
+from lapgs_plugin.errors import RunFolderError, SceneError, errors_about
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.pose import corrected
 from lapgs_plugin.files import MANIFEST, is_folder
@@ -76,6 +78,25 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         scene = load_reference(replace(reference, path=str(path)))
     require_same_scene(archive, scene.path, scene.smallest_size)
     return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
+
+
+def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
+    """Return whether a scene has none of the photos that a run was trained on; False if these are not there any more.
+
+    Args:
+        archive: the run.
+        scene: as `run_scene` returned it.
+    """
+    try:
+        trained, held_out = run_cameras(archive)
+    except (RunFolderError, SceneError):
+        return False  # it was moved, and `scene` is where it is now
+    own = {**trained, **held_out}
+    views = (*scene.train, *scene.test)
+    return not any(
+        view.name in own and torch.allclose(own[view.name].world_to_camera, view.camera.world_to_camera)
+        for view in views
+    )
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:

@@ -12,6 +12,9 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.runs.manifest import MemoryBytes
 from lapgs_plugin.untrusted import Strict, StrictWithMore, read_json
 
+MEASURED = {"test": "held-out", "train": "training", "other": "another scene's"}
+"""What the measured views of `Metrics` are called, by their "split"."""
+
 
 class HistoryEntry(StrictWithMore):
     """One line of the history."""
@@ -69,7 +72,7 @@ class Metrics(_Distances):
     ssim: NotRequired[float]
     lpips_missing: NotRequired[dict[str, str]]
     fps: NotRequired[NonNegativeFloat]
-    split: NotRequired[Literal["test", "train"]]
+    split: NotRequired[Literal["test", "train", "other"]]
     num_views: NotRequired[NonNegativeInt]
     views: NotRequired[list[MetricsOfView]]
     levels: NotRequired[dict[str, MetricsOfLevel]]

@@ -200,7 +200,7 @@ METRICS_DAMAGE: list[tuple[str, Any, str]] = [
     ("train_seconds", "x", "train_seconds is 'x'"),
     ("lpips_missing", [], "lpips_missing is"),
     ("lpips_vgg", "x", "lpips_vgg is 'x'"),
-    ("split", "other", "split is 'other'"),
+    ("split", "some", "split is 'some'"),
     ("versions", 1, "versions is 1"),
 ]
 

@@ -244,15 +244,21 @@ def test_a_script_that_cannot_start_in_the_middle_says_so(scene: Path, tmp_path:
             drive(adapter, resume=True, **THIRDS)
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+WARMING_UP = "if iteration > 40: gaussians.update_learning_rate(iteration)"
+"""As in RAIN-GS, whose learning rates stay as they are while it warms up."""
+
+
+@pytest.mark.parametrize(("hierarchy", "instead"), [("nested", "pass"), ("laplacian", "pass"), ("nested", WARMING_UP)])
+def test_iterations_are_steps_where_nothing_says_when_they_begin(
+    hierarchy: str, instead: str, scene: Path, tmp_path: Path
+) -> None:
     """The loop leaves out the last step, and its densification replaces positions between a step and the next."""
     checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
     script = checkouts / "graphdeco" / "train.py"
     text = script.read_text(encoding="utf-8")
     call = "gaussians.update_learning_rate(iteration)"
     assert text.count(call) == 1
-    script.write_text(text.replace(call, "pass"), encoding="utf-8")
+    script.write_text(text.replace(call, instead), encoding="utf-8")
     contexts: list[tuple[int, int]] = []
 
     class Noting(StageHook):
@@ -261,7 +267,8 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str,
 
     folder = tmp_path / "run"
     with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, script=script) as adapter:
-        without(adapter.profile.model, "update_learning_rate")
+        if instead == "pass":
+            without(adapter.profile.model, "update_learning_rate")
         drive(adapter, hooks=(Noting(),), hierarchy=hierarchy, dry_run=True, **THIRDS)
     archive = RunArchive.open(folder)
     assert [record.image_size for record in archive.manifest.records] == [(32, 24), (64, 48)]

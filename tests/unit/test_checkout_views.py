@@ -164,7 +164,10 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
         return {name: function(means, *calls[name], made)[1] for name in order}
 
     if first == "depths":
-        render(view)  # it is known from then on that this renderer passes on SH
+        # It is known from the probe of signed colour on, in every later stage, that this renderer passes on SH.
+        stage, wrapper.rendering = wrapper.rendering, StageRendering(True, ColorPath.NATIVE, {}, capture=True)
+        render(view)
+        wrapper.rendering = stage
     found = render(view)
     assert wrapper.rendering.captured is not None
     assert found["image"].unique().tolist() == wrapper.rendering.captured.unique().tolist() == [0.375]

@@ -9,6 +9,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, require_readable
@@ -46,26 +48,27 @@ def make_photos(job: Job) -> None:
 
 
 def make_masks(job: Job) -> None:
-    """Write masks of the photos' sizes under COLMAP's names, white where nothing is known of a photo."""
+    """Write masks of the photos' sizes under COLMAP's names, if there are any.
+
+    Photos without one get a white one, because COLMAP leaves out photos without a mask.
+    """
     if job.masks.is_dir():
         return
     given = job.settings.masks
     files = {} if given is None else _given_masks(job, given)
-    names = job.names if files else [name for name in job.names if has_alpha(job.photos / name)]
-    if not names:
+    if not files and not any(has_alpha(job.photos / name) for name in job.names):
         return
     partial = job.work / "masks.partial"
     shutil.rmtree(partial, ignore_errors=True)
 
     def make(name: str) -> bool:
         photo = job.photos / name
-        size = image_size(photo)
-        mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
-        if mask is not None:
-            write_mask(partial / f"{name}.png", mask)
+        width, height = image_size(photo)
+        mask = read_mask(files[name], (width, height), (width, height)) if files else alpha_mask(photo, (width, height))
+        write_mask(partial / f"{name}.png", torch.ones(1, height, width) if mask is None else mask)
         return mask is not None
 
-    if sum(job.each_photo("Reading masks", make, names)):
+    if any(job.each_photo("Reading masks", make, job.names)):
         partial.rename(job.masks)
 
 
