@@ -6,7 +6,6 @@ random numbers, the script's arguments and its output are as if nothing had run.
 
 from __future__ import annotations
 
-import copy
 import io
 import logging
 import random
@@ -151,9 +150,8 @@ class DryRun:
         if self._stage.signed:
             call = self._adapter.stage_call(self._call, self._context.window(self._plan, self._stage), str(folder))
         else:
-            values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
-            values["dataset"].model_path = str(folder)
-            call = self._call.changed(**values)
+            call = self._call.copied()
+            call.dataset.model_path = str(folder)
         return call.listing(lambda _: [])
 
     def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
