@@ -27,7 +27,7 @@ from typing_extensions import NotRequired
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import BARE_RECORD, one_line_errors
 from lapgs_plugin.hierarchy.plan import level_size
@@ -225,10 +225,8 @@ def import_run(
     RunArchive.require_room(out, overwrite)
     manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
     scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
-    try:
+    with errors_about(run.folder / CFG_ARGS):
         size = smallest_size(manifest.scene.path, **scene_options)
-    except UserInputError as error:  # most often about values of cfg_args
-        raise type(error)(f"{run.folder / CFG_ARGS}: {error}") from error
     fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0
