@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import ClassVar
 
@@ -99,6 +101,19 @@ class TrainingStoppedError(LapgsError):
 
 class MissingExtraError(LapgsError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+@contextmanager
+def errors_about(file: object) -> Iterator[None]:
+    """Begin the messages of a block's errors with the file whose values it uses: the user did not type them.
+
+    Raises:
+        UserInputError: the block raised it, or a kind of it.
+    """
+    try:
+        yield
+    except UserInputError as error:
+        raise type(error)(f"{file}: {error}") from error
 
 
 def require_extra(module: str, extra: str, what: str, otherwise: str = "") -> None:

@@ -79,15 +79,15 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
     if is_file(path / TRAIN_FILE):
-        values = _read_json(path / TRAIN_FILE)
+        file, values = TRAIN_FILE, _read_json(path / TRAIN_FILE)
         train, test = _read_pair(path, values, images, evaluate)
         radius = OBJECT_RADIUS
     else:
-        values = _read_json(path / SINGLE_FILE)
+        file, values = SINGLE_FILE, _read_json(path / SINGLE_FILE)
         frames = _read_frames(path, SINGLE_FILE, values, images)
         train, test = hold_out(frames, evaluate, _chosen_for_tests(frames, values))
         radius = CAPTURE_RADIUS
-    points, colors = _read_points(path, values) or _random_points([*train, *test], radius)
+    points, colors = _read_points(path, file, values) or _random_points([*train, *test], radius)
     return SceneSource("transforms", train, test, points, colors)
 
 
@@ -152,7 +152,14 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
         if image.name in ("", "..") or image == Path(os.path.normpath(path)):
             raise SceneError(f"{where} names a folder, expected the name of its image; export the scene again")
         inside = os.path.normpath(path)
-        name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
+        if image.is_relative_to(inside):
+            name = image.relative_to(inside).as_posix()
+        elif is_file(image):
+            name = image.name
+        else:
+            raise SceneError(
+                f"{where} names {image}: no such image; put it there or choose another folder with --images"
+            )
         posed = {**values, **frame}
         _refuse_distortion(posed, where)
         if not ("w" in posed and "h" in posed):
@@ -253,24 +260,27 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
     return None
 
 
-def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
     named = values.get("ply_file_path")
     if named is not None and not isinstance(named, str):
-        raise SceneError(f"{path}: ply_file_path is {named!r}, expected the name of a file; export the scene again")
+        raise SceneError(
+            f"{path / transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
+        )
     file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
     if file is None:
         return None
+    subject = f"{path / transforms} names {file}" if named else f"{file}"
     try:
         element = read_ply(file)["vertex"]
     except (OSError, KeyError, ValueError) as error:
-        raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
+        raise SceneError(f"{subject}: not readable as a PLY of points ({error}); export or remove it") from error
     vertices, channels = element.data, POINT_COLORS
     lists = {prop.name for prop in element.properties} - scalar_names(element)
     if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
         raise SceneError(
-            f"{file}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number of "
-            "each point); export or remove it"
+            f"{subject}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number "
+            "of each point); export or remove it"
         )
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not set(channels) <= scalar_names(element):

@@ -41,18 +41,21 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
 
     The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder. A
-    folder that holds all photos, such as images/, may be left out.
+    folder that holds all photos, such as images/, may be left out. Other folders are not searched: one that is named
+    by mistake may be a whole disk.
 
     Raises:
         SceneError: an image has no mask, or several.
     """
-    files = [file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES]
-    present: dict[str, list[Path]] = {}
-    for file in sorted(files):  # cameras write .JPG, other programs .jpg
-        present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
     top, _, _ = names[0].partition("/")
     common = f"{top}/" if all(name.startswith(f"{top}/") for name in names) else ""
     shorter = {name: name.removeprefix(common) for name in names}
+    parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
+    places = [place for parent in parents if is_folder(place := folder / parent)]
+    files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
+    present: dict[str, list[Path]] = {}
+    for file in sorted(files):  # cameras write .JPG, other programs .jpg
+        present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
     found = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
     if missing := [shorter[name] for name, path in found.items() if path is None]:
         stem = _stem(missing[0])
