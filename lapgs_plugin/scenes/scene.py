@@ -205,6 +205,10 @@ def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
 
 def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     """Return the frames and points of a scene folder, after checks."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise SceneError(f"{path}: not UTF-8, as which images are opened by name; rename the folder") from error
     if not is_folder(path):
         raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
     if (model := find_model(path)) is not None:
