@@ -26,7 +26,7 @@ class SceneOptions:
     masks: str = option(
         "auto",
         "Masks of the photos: a folder of images that are black where a photo is ignored, alpha (the photos' own alpha "
-        "channels), none, or auto (the scene's folder masks/ or that of mask_path in transforms.json, if there).",
+        "channels), none, or auto (the scene's folder masks/, or mask_path of transforms.json, or none).",
     )
     background: str = option(
         "black", "Background of renders and of transparent pixels: black, white or R,G,B from 0 to 1."
