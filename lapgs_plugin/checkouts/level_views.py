@@ -23,10 +23,15 @@ KEY = "lapgs_key"
 """Attribute of cameras, and of all copies of them, with the key of the image."""
 
 SCALED = {
-    **dict.fromkeys(("image_width", "width", "img_width", "w", "focal", "focal_length", "focal_x", "fx", "cx"), 0),
-    **dict.fromkeys(("image_height", "height", "img_height", "h", "focal_y", "fy", "cy"), 1),
+    **dict.fromkeys(
+        ("image_width", "width", "img_width", "w", "focal", "focal_length", "focal_x", "fl_x", "fx", "cx"), 0
+    ),
+    **dict.fromkeys(("image_height", "height", "img_height", "h", "focal_y", "fl_y", "fy", "cy"), 1),
 }
-"""Numbers of cameras in pixels by lower-case name, each with its axis: 0 is horizontal."""
+"""Numbers of cameras in pixels by lower-case name, each with its axis: 0 is horizontal.
+
+Up to 1 they are no pixels: shares of the image, or the -1 of what is unknown.
+"""
 
 INTRINSICS = {"K", "intrinsic", "intrinsics", "camera_matrix"}
 """Matrices of cameras in pixels."""
@@ -213,17 +218,23 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
         return None if opaque else shrunk(value, size)  # without a mask loops save a pass over the image
     if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
         return type(value)(size if tuple(value) == full else size[::-1])
-    if isinstance(value, (int, float, np.number)) and name.lower() in SCALED:
+    if isinstance(value, (int, float, np.number)) and name.lower() in SCALED and value > 1:
         axis, kind = SCALED[name.lower()], cast("Any", type(value))
         return kind(float(value) * size[axis] / full[axis]) if value != full[axis] else size[axis]
     return value
 
 
 def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool."""
+    """Return an image (..., h, w) at a smaller `size` (width, height).
+
+    Floats are averaged, to float32; a mask has what most of the pixels are. Whole numbers are labels, which have no
+    averages: they are sampled.
+    """
     flat = image.reshape(-1, 1, *image.shape[-2:]).float()
-    result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])
-    return result >= 0.5 if image.dtype == torch.bool else result
+    labels = not (image.is_floating_point() or image.dtype == torch.bool)
+    result = torch.nn.functional.interpolate(flat, size[::-1], mode="nearest-exact" if labels else "area")
+    result = result.reshape(*image.shape[:-2], *size[::-1])
+    return result >= 0.5 if image.dtype == torch.bool else result.to(image.dtype) if labels else result
 
 
 class PrefetchingViews(list[Any]):
