@@ -91,7 +91,7 @@ class HierarchySettings:
     split: str | None = option(
         None,
         "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2; "
-        "nested levels of `lapgs run`: 1/3,2/3.",
+        "under `lapgs run` 1/3,2/3.",
         panel=PANEL,
     )
     supervision: str = option(

@@ -54,12 +54,13 @@ class RunSettings(HierarchySettings):
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:
-        """As `HierarchySettings.shares`, but nested levels leave two thirds of a run to the finest by default.
+        """As `HierarchySettings.shares`, but two levels are split as in the paper, and nested levels like them.
 
-        A script ends its densification in the middle of its run, and so do halves end the coarser level: none would see
-        the full size.
+        A script ends its densification in the middle of its run, and so do halves end the coarser level: of nested
+        levels the finest would see none. A script's residual field gains less by a base that was trained longer than
+        it loses by its own shorter stage.
         """
-        if self.split is not None or not self.nested or self.levels == 1:
+        if self.split is not None or self.levels == 1 or not (self.nested or self.levels == 2):
             return super().shares
         coarser = self.levels - 1
         return (Fraction(1, 3 * coarser),) * coarser + (Fraction(2, 3),)

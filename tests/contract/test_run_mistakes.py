@@ -462,13 +462,13 @@ def test_what_nested_levels_cannot_honour_is_refused(
 @pytest.mark.parametrize(
     ("words", "settings", "iterations"),
     [
-        ((), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [15, 15]),
+        ((), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [10, 20]),
         (("--hierarchy", "nested"), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [10, 20]),
         (("--protocol", "paper"), {"joint": 0.0, "residual_color_rate": 1.0, "inherit": "xyz"}, [10, 20]),
         (
             ("--joint", "0", "--coarse-threshold", "2", "--residual-color-rate", "1"),
             {"joint": 0.0, "coarse_threshold": 2.0, "residual_color_rate": 1.0},
-            [15, 15],
+            [10, 20],
         ),
     ],
 )

@@ -89,11 +89,12 @@ def test_any_split_covers_the_iterations(weights: list[int], iterations: int) ->
         ({"hierarchy": "nested", "levels": 3}, "1/6,1/6,2/3"),
         ({"hierarchy": "nested", "levels": 1}, "1"),
         ({"hierarchy": "nested", "split": "1/2,1/2"}, "1/2,1/2"),
-        ({"hierarchy": "laplacian"}, "1/2,1/2"),
+        ({"hierarchy": "laplacian"}, "1/3,2/3"),
+        ({"hierarchy": "laplacian", "levels": 3}, "1/3,1/6,1/2"),
         ({"protocol": "paper"}, "1/3,2/3"),
     ],
 )
-def test_nested_levels_of_a_checkout_leave_densification_to_the_finest(given: dict[str, Any], split: str) -> None:
+def test_the_finest_level_of_a_checkout_has_the_longer_part(given: dict[str, Any], split: str) -> None:
     assert RunSettings(**given).resolved()["split"] == split
 
 
