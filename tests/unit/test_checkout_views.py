@@ -127,7 +127,8 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
         assert image.unique().tolist() == [0.5], "neither composed nor given to hooks"
         if signed:
             with pytest.raises(
-                UserInputError, match=r"other colours than the model's, .* --hierarchy nested"
+                UserInputError,
+                match=r"test_checkout_views.py:\d+: the loop trains on .* other colours than the model's, .* nested",
             ) as caught:
                 image.sum().backward()
             assert "\n" not in str(caught.value)
