@@ -202,7 +202,7 @@ def without_depth(view: Any) -> None:
 def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int]) -> Any:
     """Return an attribute of a camera at another size, the same object if it does not depend on the size."""
     if isinstance(value, np.ndarray) and value.shape[-2:] == full[::-1]:
-        return _shrunk(torch.from_numpy(value), size).numpy()
+        return shrunk(torch.from_numpy(value), size).numpy()
     if isinstance(value, (Tensor, np.ndarray)) and name in INTRINSICS and value.shape[-2:] in ((3, 3), (4, 4)):
         scaled: Any = copy.deepcopy(value)
         for row in range(2):
@@ -210,7 +210,7 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
         return scaled
     if isinstance(value, Tensor) and value.shape[-2:] == full[::-1] and value.ndim > 1:
         opaque = name == "alpha_mask" and bool((value == 1).all())
-        return None if opaque else _shrunk(value, size)  # without a mask loops save a pass over the image
+        return None if opaque else shrunk(value, size)  # without a mask loops save a pass over the image
     if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
         return type(value)(size if tuple(value) == full else size[::-1])
     if isinstance(value, (int, float, np.number)) and name.lower() in SCALED:
@@ -219,7 +219,7 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
     return value
 
 
-def _shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool."""
     flat = image.reshape(-1, 1, *image.shape[-2:]).float()
     result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])

@@ -110,11 +110,6 @@ def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasteri
     return placed_rasterizer(name, device, settings)
 
 
-def package_rasterizers() -> tuple[str, ...]:
-    """Return the names of the rasterizers that installed packages bring."""
-    return tuple(name for name in RASTERIZERS if name not in OWN)
-
-
 def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, Any] | None = None) -> PlacedRasterizer:
     """Return a rasterizer of `RASTERIZERS`, and the first of its devices that is there and asked for.
 

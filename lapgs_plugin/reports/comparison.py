@@ -12,7 +12,7 @@ from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
 
 Metrics = dict[str, Any]
-"""Content of metrics.json, see `figures.run_figures`."""
+"""Content of metrics.json, see `evaluation.figures`."""
 
 OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""

@@ -113,6 +113,8 @@ class ActiveStage:
     def optimizers_made(self, gaussians: Any) -> None:
         """Prepare the optimizers that the checkout has just set up, some in the middle of a stage again."""
         self._model.prepare_optimizers(gaussians, inherit=self.iteration == 0)
+        if self._joint is not None:
+            self._joint.follow(gaussians, self._options.color_factor)
 
     def iteration_begins(self, gaussians: Any) -> None:
         """Do everything that comes before the next iteration, and count it: the stage's first is 1."""

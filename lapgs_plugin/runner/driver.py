@@ -121,7 +121,7 @@ class HierarchyDriver:
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
         self._adapter.refuse(call, self._has_residuals)
-        require_pruning(call, self._options.prune)
+        require_pruning(call, self._options.prune, self._adapter.profile.model)
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite, self._since)

@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runner.signed_calls import signed_settings
@@ -85,9 +85,15 @@ class RasterizerWrapper:
 
         return render
 
-    def renderers(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout holds its renderers, as owners and names, each with its replacement's maker."""
-        return [(*place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+    def replacements(self, profile: Profile, consumer: str) -> list[Replacement]:
+        """Return replacements where a checkout holds its renderers, and looks rasterizers and their settings up."""
+        found = [(place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+        for rasterizer in profile.rasterizers:
+            for name in (*rasterizer.settings, *rasterizer.entries):
+                make = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
+                make = self.settings if name in rasterizer.settings else make
+                found += [(place, make) for place in profile.places(rasterizer, name)]
+        return [Replacement(*place, make, consumer) for place, make in found]
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the settings' constructor."""
@@ -103,15 +109,6 @@ class RasterizerWrapper:
             return signed_settings(settings, rendering.path, self._zero_background) if rendering.signed else settings
 
         return make_settings
-
-    def entries(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout looks rasterizers up, as owners and names, each with its replacement's maker."""
-        return [
-            (*place, self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function)
-            for rasterizer in profile.rasterizers
-            for name in rasterizer.entries
-            for place in profile.places(rasterizer, name)
-        ]
 
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:

@@ -7,7 +7,6 @@ on the backbone. Iterations are counted, because not every checkout says which o
 
 from __future__ import annotations
 
-import copy
 import logging
 import tempfile
 from collections.abc import Callable
@@ -74,9 +73,8 @@ class SingleCall:
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
-        dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
-        dataset.model_path = str(run.archive.path("level_0"))
-        self._call = run.call.changed(dataset=dataset, opt=opt)
+        self._call = run.call.copied()
+        self._call.dataset.model_path = str(run.archive.path("level_0"))
         self._stage: NestedStage | None = None
         self._advanced = False  # whether this call has trained more than one level
 
