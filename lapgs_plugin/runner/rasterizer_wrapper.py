@@ -146,7 +146,7 @@ class RasterizerWrapper:
 
             if not _has_model_colors(inputs, running, self._ways_of_sh):
                 return rendering.render_other(marked, inputs, settings, running.place)
-            return rendering.render(marked, inputs, settings, running.key)
+            return rendering.render(marked, inputs, settings, running.key, running.place)
 
         return call
 

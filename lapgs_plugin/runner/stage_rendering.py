@@ -177,14 +177,33 @@ class StageRendering:
             image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
-    def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
-        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image."""
+    def render(
+        self,
+        rasterizer: Callable[..., Any],
+        inputs: dict[str, Any],
+        settings: Any,
+        noted: str | None,
+        place: str = "the checkout",
+    ) -> Any:
+        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image.
+
+        Args:
+            rasterizer, inputs, settings: of the call.
+            noted: key of the view that a renderer was called with; None if it was called with none.
+            place: file and line where the checkout renders it.
+
+        Raises:
+            UserInputError: as `compose`; in the backward pass of a residual's maps beside the image, because they do
+                not show the whole scene.
+        """
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
         image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
             self.captured, self.call = image, Captured(rasterizer, inputs, size_of(settings))
+        for each in outputs.maps_beside if self.signed else ():
+            each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)
 
     def render_other(
@@ -230,7 +249,9 @@ class StageRendering:
         return self.accumulated if coarse is None else coarse
 
 
-def _refuse_other_colors(place: str, _: Tensor) -> None:
+def _refuse_other_colors(place: str, gradient: Tensor | None) -> None:
+    if gradient is None or not bool(gradient.any()):  # its loss has no weight
+        return
     raise UserInputError(
         f"{place}: the loop trains on an image of other colours than the model's, such as depths or features; a "
         "residual covers a part of the scene only, so its image of them is not the whole one: leave the option out "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -136,6 +137,37 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
             image.sum().backward()
     assert render(view).unique().tolist() == [1.375], "the model's own colours are composed"
     assert wrapper.running.given == ()
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_maps_beside_a_residuals_image_are_not_trained_on(signed: bool) -> None:
+    """As gaussian-grouping's features, RaDe-GS's normals: outputs of the call that renders the image."""
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    assert wrapper.rendering is not None
+    wrapper.rendering.signed = signed
+    means = torch.zeros(2, 3, requires_grad=True)
+
+    def forward(means: Tensor, shs: Tensor, rasterizer_settings: Settings) -> dict[str, Tensor]:
+        size = rasterizer_settings.image_height, rasterizer_settings.image_width
+        found = {"radii": (3,), "image": (3, *size), "depth": size, "normals": (*size, 3), "features": (16, *size)}
+        return {name: means.mean().expand(shape) * 1 for name, shape in found.items()}
+
+    function = wrapper._function(forward)
+
+    @wrapper.renderer
+    def render(viewpoint: Any) -> dict[str, Tensor]:
+        found: dict[str, Tensor] = function(means, torch.ones(2, 1, 3), settings(3, 4, torch.zeros(3), torch.eye(4)))
+        return found
+
+    found = render(make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4)))
+    (found["image"].sum() + found["radii"].sum() + 0 * found["depth"].sum()).backward(retain_graph=True)
+    for name in ("depth", "normals", "features"):
+        refused = pytest.raises(
+            UserInputError, match=r"test_checkout_views.py:\d+: the loop trains on an image of other"
+        )
+        with refused if signed else nullcontext():
+            found[name].sum().backward(retain_graph=True)
 
 
 @pytest.mark.parametrize(("model", "first"), [("sh", "image"), ("sh", "depths"), ("colors", "image")])
