@@ -220,7 +220,13 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
 
 
 def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool."""
+    """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool.
+
+    Integers are labels, such as those of objects: the middle one of each pixel is taken.
+    """
+    if not (image.is_floating_point() or image.dtype == torch.bool):
+        columns, rows = (((torch.arange(n) + 0.5) * old / n).long() for n, old in zip(size, image.shape[:-3:-1]))
+        return image[..., rows[:, None].to(image.device), columns.to(image.device)]
     flat = image.reshape(-1, 1, *image.shape[-2:]).float()
     result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])
     return result >= 0.5 if image.dtype == torch.bool else result

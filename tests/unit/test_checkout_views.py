@@ -33,6 +33,7 @@ class Camera(nn.Module):
         self.focal_x, self.focal_y, self.Cx, self.FoVx = 10.0, np.float32(12.0), 4.0, 0.7
         self.K = np.array([[10.0, 0, 4], [0, 12, 3], [0, 0, 1]])
         self.mask = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % WIDTH < WIDTH // 2
+        self.objects = torch.arange(HEIGHT * WIDTH, dtype=torch.uint8).reshape(HEIGHT, WIDTH) % 5 * 50
         self.invdepthmap, self.depth_mask, self.depth_reliable = np.ones((HEIGHT, WIDTH), np.float32), None, True
         self.alpha_mask = torch.ones(1, HEIGHT, WIDTH)
         self.world_view_transform = torch.randn(4, 4, generator=torch.Generator().manual_seed(len(name)))
@@ -56,6 +57,8 @@ def test_attributes_follow_the_size_of_the_level() -> None:
     assert (view.focal_x, view.focal_y, view.Cx, view.FoVx) == (5.0, 6.0, 2.0, 0.7), "also a number of NumPy"
     assert view.K.tolist() == [[5, 0, 2], [0, 6, 1.5], [0, 0, 1]]
     assert view.mask.tolist() == [[[True, True, False, False]] * 3]
+    assert view.objects.dtype == torch.uint8, "labels"
+    assert view.objects.tolist() == camera.objects[1::2, 1::2].tolist(), "never a mean of two"
     assert view.invdepthmap.shape == (3, 4)
     assert view.alpha_mask is None, "opaque"
     assert view.original_image.shape == (3, 3, 4)
