@@ -225,7 +225,10 @@ def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
     Integers are labels, such as those of objects: the middle one of each pixel is taken.
     """
     if not (image.is_floating_point() or image.dtype == torch.bool):
-        columns, rows = (((torch.arange(n) + 0.5) * old / n).long() for n, old in zip(size, image.shape[:-3:-1]))
+        height, width = image.shape[-2:]
+        columns, rows = (
+            ((torch.arange(n) + 0.5) * old / n).long() for n, old in zip(size, (width, height), strict=True)
+        )
         return image[..., rows[:, None].to(image.device), columns.to(image.device)]
     flat = image.reshape(-1, 1, *image.shape[-2:]).float()
     result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])
