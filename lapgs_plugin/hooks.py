@@ -122,7 +122,7 @@ class StageHook:
 
         Args:
             context: the iteration.
-            image: (3, h, w) composed prediction.
+            image: (3, h, w) composed prediction, at the exposure of the photo where that is compensated.
 
         Returns:
             A scalar, or None to add nothing.

@@ -26,6 +26,7 @@ from lapgs_plugin.scenes.masks import (
     NONE,
     alpha_mask,
     find_masks,
+    has_photo_suffix,
     read_mask,
     refuse_photos,
     resolve_masks,
@@ -210,7 +211,10 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     except UnicodeEncodeError as error:
         raise SceneError(f"{path}: not UTF-8, as which images are opened by name; rename the folder") from error
     if not is_folder(path):
-        raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
+        raise SceneError(
+            f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json, or make one from "
+            "photos or a video with `lapgs prepare PHOTOS OUT`"
+        )
     if (model := find_model(path)) is not None:
         source = read_colmap(path, model, images, evaluate)
     elif has_transforms(path):
@@ -228,8 +232,8 @@ def _what_to_give(path: Path) -> str:
     folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
-    known = (path / name for name in ("keyframes/images", "images", "input"))  # the first is Polycam's
-    photos = next((str(folder) for folder in known if is_folder(folder)), "PHOTOS")
+    known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
+    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 

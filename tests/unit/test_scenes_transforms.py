@@ -350,6 +350,10 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ),
         ({"cx": -1e300}, r"principal point \(-1e\+300, 29.5\), expected at most"),
         ({"w": 1e19, "h": 1e19, "fl_x": 1e19, "fl_y": 1e19}, "1e.19 pixels wide or high, expected at most 2147483648"),
+        (
+            {"fl_x": None, "camera_angle_x": 40.0},
+            r"frame 0 .* has camera_angle_x 40, expected radians, less than 3\.14",
+        ),
         ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
         ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
         ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
