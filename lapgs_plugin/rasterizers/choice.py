@@ -81,7 +81,7 @@ def _raster_settings(manifest: Manifest) -> dict[str, Any]:
 
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
     """Return the available rasterizer that is most similar to that of the training, and the reason."""
-    same = "the one it was trained with"
+    same = "as in training"
     failed = ""
     if trained in package_rasterizers():
         try:
@@ -182,7 +182,7 @@ def _split(settings: Mapping[str, Any], known: frozenset[str] | set[str]) -> tup
 def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     name = placed.rasterizer.name
     place = torch.cuda.get_device_name() if placed.device.type == "cuda" else "the CPU"
-    line = f"rendering with {name} on {place}: {why}"
+    line = f"rendering with {'the CPU rasterizer' if name == 'cpu' else f'{name} on {place}'}: {why}"
     if name != manifest.rasterizer:
         line += f"; the run was trained with {manifest.rasterizer}, images may differ slightly"
     if placed.unsupported:
