@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import ClassVar
 
@@ -58,13 +60,13 @@ class LapgsError(Exception):
     """An error that one line explains; the command line prints it and exits with `exit_code`.
 
     The message says what was wrong, the value received, what was expected and what to do next. It is always one
-    printable line.
+    printable line; an error about several mistakes has a line for each.
     """
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, message: str = "") -> None:
-        super().__init__(one_line(message))
+    def __init__(self, *lines: str) -> None:
+        super().__init__("\n".join(map(one_line, lines)))
 
 
 class UserInputError(LapgsError, ValueError):
@@ -99,6 +101,19 @@ class TrainingStoppedError(LapgsError):
 
 class MissingExtraError(LapgsError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+@contextmanager
+def errors_about(file: object) -> Iterator[None]:
+    """Begin the messages of a block's errors with the file whose values it uses: the user did not type them.
+
+    Raises:
+        UserInputError: the block raised it, or a kind of it.
+    """
+    try:
+        yield
+    except UserInputError as error:
+        raise type(error)(f"{file}: {error}") from error
 
 
 def require_extra(module: str, extra: str, what: str, otherwise: str = "") -> None:

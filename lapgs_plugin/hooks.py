@@ -21,9 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 
+import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, typed_line
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_values
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import Reconstructed, Supervision
@@ -33,6 +37,36 @@ from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
 
 ENTRY_POINT_GROUP = "lapgs_plugin.hooks"
 """Entry point group whose members are StageHook classes, created without arguments for every run."""
+
+
+@dataclass(frozen=True)
+class FieldInTraining:
+    """Render more of the field in training than its colours, such as depths for a term of the loss.
+
+    Attributes:
+        gaussians: the field as this iteration renders it; of a residual stage, the residual alone. Gradients reach its
+            parameters.
+        camera: of the view, at the stage's size.
+        rasterizer: of the run.
+    """
+
+    gaussians: GaussianField
+    camera: Camera
+    rasterizer: Rasterizer
+
+    def render(self, values: Tensor) -> Tensor:
+        """Return values (n, 3) of the Gaussians blended as colours are, over zero: (3, h, w) with gradients."""
+        return render_values(self.rasterizer, self.gaussians, self.camera, values)
+
+    def depth(self) -> tuple[Tensor, Tensor]:
+        """Return blended depths and opacity, (h, w) each, with gradients; their quotient is the mean depth of a pixel.
+
+        Depths are distances along the camera's axis in world units.
+        """
+        pose = self.camera.world_to_camera.to(self.gaussians.means)
+        depths = self.gaussians.means @ pose[2, :3] + pose[2, 3]  # (n,)
+        blended, opacity, _ = self.render(torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1))
+        return blended, opacity
 
 
 @dataclass(frozen=True)
@@ -47,6 +81,8 @@ class StageContext:
         accumulated: (3, h, w) Up(I_hat^(l+1)) of the view, unclamped; None for the base.
         coarse_target: (3, h, w) Up(I^(l+1)) of the ground truth; None unless the supervision needs it.
         weight: (1, h, w) share of each pixel inside of the view's mask; None without masks.
+        field: the field in training, while the view is rendered and its loss computed; None otherwise, and always
+            under `lapgs run`, where the checkout's code renders.
     """
 
     stage: Stage
@@ -56,6 +92,7 @@ class StageContext:
     accumulated: Tensor | None = None  # (3, h, w)
     coarse_target: Tensor | None = None  # (3, h, w)
     weight: Tensor | None = None  # (1, h, w)
+    field: FieldInTraining | None = None
 
 
 class StageHook:
@@ -85,7 +122,7 @@ class StageHook:
 
         Args:
             context: the iteration.
-            image: (3, h, w) composed prediction.
+            image: (3, h, w) composed prediction, at the exposure of the photo where that is compensated.
 
         Returns:
             A scalar, or None to add nothing.
@@ -249,7 +286,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
             hook = entry.load()()
         except Exception as error:  # any error of a plugin's code must name the plugin
             raise UserInputError(
-                f"hook {source} cannot be created: {type(error).__name__}: {error}; "
+                f"hook {source} cannot be created: {typed_line(error)}; "
                 "expected a StageHook class without arguments, fix or uninstall the package that brings it"
             ) from error
         verify_hook(hook, source)

@@ -9,6 +9,7 @@ that derive from `Strict`, accept no other types, no unknown keys and no NaN.
 
 from __future__ import annotations
 
+import codecs
 import math
 import os
 import re
@@ -88,7 +89,7 @@ def read_json(
     Raises:
         UserInputError: as `error`: the file cannot be read, is too large, is not JSON, or holds something else.
     """
-    data = _read_json_bytes(path, 1 if kind is Any else 8, error, advice)
+    data = _read_json_bytes(path, 1 if kind is Any else 8, error, advice).removeprefix(codecs.BOM_UTF8)
     return parse_json(data, str(path), kind, error=error, advice=advice, finite=finite)
 
 

@@ -17,7 +17,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.adapters.info import BackboneInfo
@@ -227,10 +227,8 @@ class BackboneAdapter:
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         """Return the call for one stage: schedule scaled to its length, its own output folder, its learning rates."""
-        call = self.call_of_residuals(call) if window.stage.signed else call
-        copies = {role: copy.copy(call.values[name]) for role, name in call.roles.items()}
-        dataset, opt, pipe = copies["dataset"], copies["opt"], copies.get("pipe", SimpleNamespace())
-        parsed = {name: copy.copy(value) for name, value in call.values.items() if isinstance(value, Namespace)}
+        call = (self.call_of_residuals(call) if window.stage.signed else call).copied(parsed=True)
+        dataset, opt, pipe = call.dataset, call.opt, call.pipe
         dataset.model_path = model_path
         opt.iterations = window.stage.iterations
         for name in ("densify_until_iter", "position_lr_max_steps"):
@@ -247,16 +245,15 @@ class BackboneAdapter:
             # A white background would be added a second time, and would trigger an opacity reset of its own.
             dataset.white_background = False
             # A residual's opacity says where detail is missing, not where surfaces are.
-            for options in (opt, *parsed.values()):
+            for options in (opt, *(value for value in call.values.values() if isinstance(value, Namespace))):
                 for name in _options(options, "depth", "weight"):
                     setattr(options, name, 0.0)
             for name in _options(opt, "feature", "_lr"):
                 setattr(opt, name, getattr(opt, name) * window.residual_color_rate)
-        values: dict[str, Any] = {**parsed, **copies, **dict.fromkeys(CHECKPOINTS)}
         debug_from = call.values.get("debug_from", -1)
         pipe.debug = getattr(pipe, "debug", False) or 0 <= debug_from < window.start
-        values["debug_from"] = debug_from - window.start if debug_from >= window.start else -1
-        return call.changed(**values).listing(window.local)
+        debug_from = debug_from - window.start if debug_from >= window.start else -1
+        return call.changed(debug_from=debug_from, **dict.fromkeys(CHECKPOINTS)).listing(window.local)
 
     def call_of_residuals(self, call: TrainingCall) -> TrainingCall:
         """Return the call by which residuals are rendered."""

@@ -6,7 +6,6 @@ for a residual, whose Gaussians come from the level below.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -43,13 +42,13 @@ class Adapter(BackboneAdapter):
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         self._degree = call.dataset.sh_degree
         changed = super().stage_call(call, window, model_path)
-        if not hasattr(call.values.get("args"), SIMPLIFICATIONS[0]):
+        if not hasattr(changed.values.get("args"), SIMPLIFICATIONS[0]):
             return changed  # gs/train.py is plain 3DGS
-        args = copy.copy(call.values["args"])
+        args = changed.values["args"]
         for name in SIMPLIFICATIONS:
             never = window.stage.iterations + 1
             setattr(args, name, never if window.stage.signed else window.scaled(getattr(args, name)))
-        return changed.changed(args=args)
+        return changed
 
     def replacements(self, in_residual: Callable[[], bool]) -> list[Replacement]:
         model, start = self.profile.model, "Scene, and fields that inherit"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import sys
 from collections.abc import Callable
@@ -83,7 +82,7 @@ class Adapter(BackboneAdapter):
 
     def stage_call(self, call: TrainingCall, window: StageWindow, model_path: str) -> TrainingCall:
         changed = super().stage_call(call, window, model_path)
-        args, opt = copy.copy(call.values["args"]), changed.opt
+        args, opt = changed.values["args"], changed.opt
         # Its table of counts has one entry an interval; a lookup is past its end unless densification starts and stops
         # at whole intervals.
         opt.densify_from_iter = -(-opt.densify_from_iter // opt.densification_interval) * opt.densification_interval
@@ -98,7 +97,7 @@ class Adapter(BackboneAdapter):
         opt.densify_until_iter = opt.densify_from_iter + intervals * opt.densification_interval
         args.mode, args.budget = "final_count", self._budget(call, window)
         logger.info("level %d may grow to %d Gaussians", window.stage.level, args.budget)
-        return changed.changed(args=args)
+        return changed
 
     def _budget(self, call: TrainingCall, window: StageWindow) -> int:
         """Return the number of Gaussians that a stage may grow to."""

@@ -28,13 +28,14 @@ __all__ = ["cuda_on_cpu"]
 
 
 @contextmanager
-def cuda_on_cpu(variant: str | None) -> Iterator[None]:
+def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[None]:
     """Let a checkout run without CUDA inside a `with` block, and restore everything at its end.
 
     Symbols are replaced in the whole process; devices in calls of torch functions are redirected in this thread only.
 
     Args:
         variant: stand-in for the checkout's rasterizer, a key of `standins.VARIANTS`; None for a script without one.
+        neighbours: as of `standins.install`.
 
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
@@ -43,7 +44,7 @@ def cuda_on_cpu(variant: str | None) -> Iterator[None]:
     import_module("torch._dynamo")  # it has tables of torch.cuda's functions, and optimizers import it later
     with ExitStack() as stack:
         if variant is not None:
-            stack.enter_context(install(variant))
+            stack.enter_context(install(variant, neighbours=neighbours))
         needs_logs = variant is not None and VARIANTS[variant].needs_logs
         stack.enter_context(_replaced(sys.modules, absent_modules(needs_logs)))
         stack.enter_context(_replaced(vars(torch.cuda), _WITHOUT_CUDA))

@@ -154,6 +154,18 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
+    def hindrance(self, parameters: Iterable[str]) -> str | None:
+        """Return why no level can be trained; None if the sources do not say.
+
+        Args:
+            parameters: attributes of the model that a field is archived from.
+        """
+        if absent := self.unknown_attributes(parameters):
+            return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
+        if (several := self.image_scales) is not None:
+            return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
+        return None
+
     def unknown_attributes(self, names: Iterable[str]) -> list[str]:
         """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
         trees = [parsed_quietly(path) for path in self.modules.values()]
@@ -162,6 +174,17 @@ class CheckoutSource:
             return []
         known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
         return [name for name in names if name not in known]
+
+    def unpacks(self, function: str) -> bool:
+        """Return whether the checkout unpacks what a function of that name returns, or takes one of its results."""
+        for node in (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path))):
+            if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+                call = node.value if isinstance(node.slice.value, int) else None
+            else:
+                call = node.value if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) else None
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
+                return True
+        return False
 
     def own_package(self, package: str) -> OwnPackage | None:
         """Return the folder of the checkout that a package is installed from; None if there is none."""

@@ -5,6 +5,7 @@ Imports no torch.
 
 from __future__ import annotations
 
+import copy
 import inspect
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,7 +22,10 @@ ROLES = {
     "opt": ("iterations", "densify_until_iter", "position_lr_init"),
     "pipe": ("convert_SHs_python", "compute_cov3D_python", "debug"),
 }
-"""Arguments of `training` by role, each with attributes of which it has one; the first such argument has the role."""
+"""Arguments of `training` by role, each with attributes of which it has one.
+
+The first such argument has the role, one with all of the script's options only if there is no other.
+"""
 
 CHECKPOINTS = ("checkpoint", "start_checkpoint")
 """Parameters of `training` for a checkpoint to start from."""
@@ -60,8 +64,9 @@ class TrainingCall:
                     f"{function.__name__}() of the script got {len(unnamed)} argument(s) in *{name}, expected all by "
                     "name; `lapgs run --off` runs the script as it is"
                 )
+        names = sorted(values, key=lambda name: isinstance(values[name], Namespace))
         found = {
-            role: next((name for name, value in values.items() if any(hasattr(value, a) for a in attributes)), None)
+            role: next((name for name in names if any(hasattr(values[name], a) for a in attributes)), None)
             for role, attributes in ROLES.items()
         }
         for role in ("dataset", "opt"):
@@ -115,6 +120,13 @@ class TrainingCall:
         named = {self.roles.get(name, name): value for name, value in values.items()}
         known = {name: value for name, value in named.items() if name in self.values}
         return replace(self, values={**self.values, **known})
+
+    def copied(self, *, parsed: bool = False) -> TrainingCall:
+        """Return the call with copies of the arguments that have roles, and with `parsed` of all parsed options."""
+        names = set(self.roles.values())
+        if parsed:
+            names |= {name for name, value in self.values.items() if isinstance(value, Namespace)}
+        return replace(self, values={**self.values, **{name: copy.copy(self.values[name]) for name in names}})
 
     def listing(self, change: Callable[[Sequence[int]], list[int]]) -> TrainingCall:
         """Return the call with other lists of iterations: arguments, and parsed options among the arguments."""

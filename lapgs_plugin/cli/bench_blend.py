@@ -42,7 +42,7 @@ def blend(
     from lapgs_plugin.evaluation import bench_blend, bench_raster
     from lapgs_plugin.fields.gaussian_field import GaussianField
 
-    counts = [int(each) if each.strip().isdigit() else 0 for each in views.split(",")]
+    counts = [int(each) if each.strip().isdecimal() else 0 for each in views.split(",")]
     if min(counts) < 1:
         raise UserInputError(f"--views {views!r}: expected numbers of views such as 1,8")
     cases = bench_raster.parse_cases(sizes)

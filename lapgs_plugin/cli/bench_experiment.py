@@ -32,10 +32,12 @@ from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
 
 SET_BY_EXPERIMENTS = {
-    *("scene", "out", "iterations", "resolution", "images", "hold_out", "seed", "rasterizer", "resume", "overwrite"),
-    *("script", "arguments", "off", "record", "view", "view_port"),
+    *("scene", "out", "iterations", "resolution", "images", "eval", "seed", "rasterizer", "resume", "overwrite"),
+    *("script", "arguments", "off", "record", "view", "view_port", "config"),
 }
-"""Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own."""
+"""Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own.
+
+A settings file would hide from a run's name what decides its result."""
 
 
 class RunsFailedError(LapgsError):

@@ -64,7 +64,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers.choice import package_rasterizers
+    from lapgs_plugin.rasterizers.choice import OWN, RASTERIZERS
     from lapgs_plugin.rasterizers.extensions import installed_extensions
     from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
@@ -80,7 +80,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
         found[gsplat.NAME] = lambda: [
             Subject(gsplat.NAME, gsplat.GsplatRasterizer(), device="cuda", semantics=gsplat.SEMANTICS)
         ]
-    for name in package_rasterizers():
+    for name in (name for name in RASTERIZERS if name not in OWN):
         found.setdefault(name, lambda name=name: [_package_subject(name)])  # type: ignore[misc]  # as above
     return found
 
@@ -88,9 +88,9 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
 def _package_subject(name: str) -> Subject:
     """Return the rasterizer that an installed package brings."""
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers.choice import package_rasterizer
+    from lapgs_plugin.rasterizers.choice import placed_rasterizer
 
-    placed = package_rasterizer(name)
+    placed = placed_rasterizer(name)
     return Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)
 
 

@@ -112,11 +112,7 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
 
 
 def _kinds(source: CheckoutSource) -> list[Finding]:
-    if absent := source.unknown_attributes(adapter_class(source.root).archived_parameters()):
-        why = f"its Gaussians ({source.model[1]}) have no {', '.join(absent)}, from which fields are archived"
-        return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
-    if (several := source.image_scales) is not None:
-        why = f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
+    if why := source.hindrance(adapter_class(source.root).archived_parameters()):
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     taken = {module: set[str]() for module in source.rasterizer_modules}
     for use in source.rasterizers:

@@ -75,8 +75,8 @@ def evaluate(
     The metrics are means over views of float images clamped to [0, 1], as 3DGS reports them. PSNR is also measured on
     the right half of each view after an affine colour fit on its left half, for photos whose exposure changes. LPIPS is
     skipped if the weights of its network are missing. A run without held-out views (`lapgs train --eval`) is measured
-    on its training views, where the metrics are higher. The output also shows training times and frames per second of
-    the composed image.
+    on its training views, where the metrics are higher. If --scene has other photos than the run was trained on, all of
+    them are measured. The output also shows training times and frames per second of the composed image.
 
     With --trajectory the command measures flicker instead: how much each frame differs from the one before after
     warping it by the rendered depth, where both show the same surface. It writes RUN/stability.json.
@@ -174,14 +174,18 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
 def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     from lapgs_plugin.evaluation.lpips import lpips_titles, missing_lines
 
-    kind = "held-out" if metrics["split"] == "test" else "TRAINING (nothing was held out)"
+    kind, scene = {
+        "test": ("held-out view", ""),
+        "train": ("TRAINING (nothing was held out) view", ""),
+        "other": ("view", " of a scene that it was not trained on"),
+    }[metrics["split"]]
     where = " inside their masks" if metrics["masked"] else ""
     if where and lpips_titles(metrics):
         where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
-        f"{counted(metrics['num_views'], kind + ' view')}{where}; "
+        f"{counted(metrics['num_views'], kind)}{scene}{where}; "
         f"optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second"
     )

@@ -28,7 +28,7 @@ def make_console(*, stderr: bool = False) -> Console:
     from rich.console import Console
 
     made = Console(stderr=stderr, highlight=False)
-    if not made.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
+    if not made.is_terminal and not os.environ.get("COLUMNS", "").isdecimal():
         made.width = UNLIMITED
     return made
 

@@ -104,6 +104,8 @@ def run(
     path, words = require_script(script), arguments or []
     watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
     kind, root = _recognised(path, options.backbone, needed=not plain)
+    if kind is not None and not options.off:
+        _require_levels(path, kind)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
@@ -128,6 +130,7 @@ def _execute(
     """Execute the script: with a hierarchy, or unchanged with --off."""
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
@@ -135,7 +138,9 @@ def _execute(
 
     on_device: AbstractContextManager[None] = nullcontext()
     if device == "cpu":
-        on_device = cuda_on_cpu(None if kind is None else kind.stand_in_for(root, arguments))
+        variant = None if kind is None else kind.stand_in_for(root, arguments)
+        neighbours = kind is not None and CheckoutSource.read(script).unpacks("distCUDA2")
+        on_device = cuda_on_cpu(variant, neighbours=neighbours)
     try:
         with on_device, loaded_script(script, arguments) as loaded:
             if kind is None or (options.off and not options.record):
@@ -161,6 +166,18 @@ def _execute(
         if line is None:
             raise
         raise line from error
+
+
+def _require_levels(script: Path, kind: type[BackboneAdapter]) -> None:
+    """Refuse a checkout without levels by its sources, before its packages are missed.
+
+    Raises:
+        UserInputError: it cannot be trained in levels.
+    """
+    from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
+
+    if why := CheckoutSource.read(script).hindrance(kind.archived_parameters()):
+        raise UserInputError(f"{script} cannot be trained in levels: {why}; {OTHERWISE}")
 
 
 def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:

@@ -16,7 +16,7 @@ from lapgs_plugin.cli.config_file import ConfigOption, extend_config, write_conf
 from lapgs_plugin.cli.output import make_console, require_place
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option, option_values
 from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
@@ -189,7 +189,7 @@ def _resume(
     from lapgs_plugin.rendering.run import load_reference, require_same_scene
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.training.backend import training_rasterizer
-    from lapgs_plugin.training.planning import check_storage
+    from lapgs_plugin.training.planning import check_storage, make_plan
 
     with one_line_errors(out, "read"):
         begun = (out / MANIFEST).is_file()
@@ -212,8 +212,11 @@ def _resume(
             if anew:
                 raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
-        loaded = load_reference(replace(manifest.scene, path=str(scene.absolute())))
+        with errors_about(archive.path(MANIFEST)):
+            loaded = load_reference(replace(manifest.scene, path=str(scene.absolute())))
         require_same_scene(archive, scene, loaded.smallest_size)
+        with errors_about(archive.path(MANIFEST)):
+            make_plan(loaded.smallest_size, settings, len(loaded.train))
     except BaseException:
         archive.close()
         raise

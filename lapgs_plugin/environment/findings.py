@@ -21,7 +21,6 @@ from lapgs_plugin.environment.probes import Probe, run_probe
 from lapgs_plugin.errors import typed_line
 from lapgs_plugin.limits import usable_processors
 
-OLDEST_PYTHON = (3, 10)
 NOT_REPORTED = ("", "dev")
 """Extras that are none, or for development."""
 
@@ -55,18 +54,10 @@ class Finding:
 
 def system_findings() -> list[Finding]:
     """Report Python, operating system, processor, memory and the environment variables that matter."""
-    wanted = ".".join(map(str, OLDEST_PYTHON))
-    old = sys.version_info < OLDEST_PYTHON
-    python = Finding(
-        "Python",
-        "problem" if old else "ok",
-        f"{platform.python_version()} ({sys.executable})",
-        f"use Python {wanted} or newer" if old else "",
-    )
     memory = _memory_gib()
     machine = f"{processor_name()}, {usable_processors()} cores usable"
     return [
-        python,
+        Finding("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
         Finding("System", "ok", platform.platform(terse=True)),
         Finding("Processor", "ok", machine if memory is None else f"{machine}, {memory:.1f} GiB memory"),
         *(Finding(name, "ok", os.environ[name]) for name in VARIABLES if name in os.environ),

@@ -58,7 +58,7 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
 
     shapes = {}
     for entry in (text or "x".join(map(str, blend_kernels.SHAPE))).split(","):
-        numbers = [int(number) if number.isdigit() else 0 for number in entry.strip().split("x")]
+        numbers = [int(number) if number.isdecimal() else 0 for number in entry.strip().split("x")]
         if not 4 <= len(numbers) <= 6 or any(number < 1 or number & (number - 1) for number in numbers):
             raise UserInputError(f"--shapes {entry!r}: expected 4 to 6 powers of 2 such as 8x8x4x2")
         shape = blend_kernels.Shape(*numbers)

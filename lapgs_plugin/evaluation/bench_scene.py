@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin.evaluation.cases import make_camera, random_case
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.reference_raster import layout, oracle
@@ -24,28 +25,14 @@ class BenchScene:
 
 def make_scene(width: int, height: int, gaussians: int, dtype: torch.dtype) -> BenchScene:
     """Make a random field that fills the view of a camera at the origin; each pixel blends about 40 Gaussians."""
-    n = gaussians
-    focal = max(width, height) * math.sqrt(3) / 2  # 60 degrees across the longer side
-    camera = Camera(width, height, focal, focal, width / 2, height / 2, torch.eye(4, dtype=dtype))
-    generator = torch.Generator().manual_seed(n)
-
-    def uniform(columns: int, low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(n, columns, generator=generator, dtype=torch.float64)
-
-    depths = uniform(1, 1.0, 6.0)
-    # A tenth of a side beyond each border, so that pixels there blend as many Gaussians.
-    corners = torch.tensor([width, height]) * (uniform(2, -0.1, 1.1) - 0.5) / focal
-    spacing = math.sqrt(1.44 * width * height / n)  # pixels between neighbours, were they in one plane
-    sizes = torch.exp(uniform(3, math.log(0.43), math.log(2.86))) * spacing  # standard deviations in pixels
-    scene = GaussianField(
-        means=torch.cat([corners * depths, depths], dim=1),
-        quaternions=torch.randn(n, 4, generator=generator, dtype=torch.float64),
-        log_scales=torch.log(sizes * depths / focal),
-        opacity_logits=uniform(1, -4.0, 0.0)[:, 0],
-        sh=0.3 * torch.randn(n, 16, 3, generator=generator, dtype=torch.float64),
-    )
+    spacing = math.sqrt(1.44 * width * height / gaussians)  # pixels between neighbours, were they in one plane
+    sizes = 0.43 * spacing, 2.86 * spacing
+    case = random_case(gaussians, width, height, seed=gaussians, camera=make_camera(width, height), pixels=sizes)
+    generator = torch.Generator().manual_seed(gaussians)
+    logits = -4.0 * torch.rand(gaussians, generator=generator, dtype=torch.float64)
+    case = replace(case, field=case.field.with_parameters({"opacity_logits": logits})).to(dtype)
     target = torch.rand(3, height, width, generator=generator, dtype=torch.float64)
-    return BenchScene(scene.to(dtype=dtype), camera, target.to(dtype))
+    return BenchScene(case.field, case.camera, target.to(dtype))
 
 
 @torch.no_grad()

@@ -251,8 +251,10 @@ def _compare(
     band_error = _largest((actual.image - expected.image)[:, mask.pixels])
     problems += _band_problems(actual, mask, case, bounds.image)
 
-    blended = _blended(expected)
-    culled_freely = ~blended if not subject.semantics.three_sigma_cut else torch.zeros_like(blended)  # (n,)
+    by_opacity = expected.gradients["opacity_logits"]
+    assert by_opacity is not None
+    # A Gaussian that contributes to no pixel outside the band may be culled.
+    culled_freely = (by_opacity == 0) & (not subject.semantics.three_sigma_cut)  # (n,)
     errors["radii"], radius_problems = _compare_radii(actual.radii, expected.radii, mask.radii, culled_freely)
     problems += radius_problems
     shown = (actual.radii > 0) & (expected.radii > 0)  # (n,)
@@ -292,13 +294,6 @@ def _band_problems(actual: _Rendered, mask: ThresholdMask, case: Case, tolerance
     outside = int(((pixels < low) | (pixels > high)).sum())
     if outside:
         yield f"{outside} values in the band are outside the range of the scene's colours"
-
-
-def _blended(expected: _Rendered) -> Tensor:
-    """Return (n,) whether each Gaussian contributes to a pixel outside the band, judged by its opacity's gradient."""
-    gradient = expected.gradients["opacity_logits"]
-    assert gradient is not None
-    return gradient != 0
 
 
 def _compare_radii(actual: Tensor, expected: Tensor, is_open: Tensor, culled_freely: Tensor) -> tuple[float, list[str]]:

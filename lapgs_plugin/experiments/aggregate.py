@@ -348,7 +348,7 @@ def _number(row: Row, name: str) -> float:
     value = row[name]
     if not isinstance(value, int | float):
         raise RunFolderError(
-            f"the results of {row.get('run_id', 'a run')} have {name} {shortened(value)}, expected a number; run the "
+            f"the results of {row.get('run', 'a run')} have {name} {shortened(value)}, expected a number; run the "
             "experiment again in another folder"
         )
     return value

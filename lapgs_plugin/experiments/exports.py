@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import MissingExtraError, RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, require_extra
 from lapgs_plugin.files import atomic_write, one_line_errors, write_text
 from lapgs_plugin.untrusted import parse_json, shortened
 
@@ -40,13 +40,10 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         MissingExtraError: pyarrow is not installed.
         RunFolderError: it cannot be written.
     """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path.name} is not written: pyarrow is not installed; pip install 'lapgs_plugin[parquet]'"
-        ) from error
+    require_extra("pyarrow", "parquet", path.name)
+    import pyarrow
+    import pyarrow.parquet
+
     try:
         table = pyarrow.table({name: [row.get(name) for row in rows] for name in columns_of(rows)})
     except (pyarrow.ArrowException, OverflowError) as error:

@@ -46,7 +46,7 @@ class Mistakes:
             ExperimentError: there are mistakes.
         """
         if self._lines:
-            raise ExperimentError(self._lines)
+            raise ExperimentError(*self._lines)
 
     def scene_key(self, name: str) -> str:
         """Return the key of a scene in the file."""

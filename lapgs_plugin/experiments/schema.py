@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lapgs_plugin.errors import UserInputError, one_line
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
@@ -27,9 +27,6 @@ Options = dict[str, bool | int | float | str]
 
 class ExperimentError(UserInputError):
     """Mistakes in an experiment file, one line each."""
-
-    def __init__(self, lines: Iterable[str]) -> None:
-        Exception.__init__(self, "\n".join(map(one_line, lines)))
 
 
 def _known_preset(name: str) -> str:
@@ -264,7 +261,7 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
     else:
         problems = _option_problems(experiment, option_names)
     if problems:
-        raise ExperimentError(f"{path}: {problem}" for problem in problems)
+        raise ExperimentError(*(f"{path}: {problem}" for problem in problems))
     return experiment
 
 

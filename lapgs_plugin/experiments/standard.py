@@ -106,8 +106,6 @@ class PaperTable:
             None when neither they nor the whole data set are printed.
         """
         single = [self._figures.get((dataset, scene, row), {}).get(column) for scene in scenes]
-        if len(single) == 1 and single[0] is not None:
-            return PaperFigure(single[0], True)
         whole = self._figures.get((dataset, "", row), {}).get(column)
         complete = dataset in DATASETS and set(scenes) == set(DATASETS[dataset].scenes)
         if whole is not None and complete:

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from lapgs_plugin import __version__
 from lapgs_plugin.environment import run_program, versions
-from lapgs_plugin.errors import LapgsError, one_line
+from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 
@@ -77,9 +77,6 @@ def work(
 class RunFailedError(LapgsError):
     """A command of a run failed; the message has the end of its log, line by line."""
 
-    def __init__(self, message: str) -> None:
-        Exception.__init__(self, "\n".join(map(one_line, message.split("\n"))))
-
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
     """Train and evaluate one run.
@@ -102,7 +99,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
         for step in job.steps:
             if code := _execute(step, stream, store, claim, slot, stop):
                 stream.flush()
-                raise RunFailedError(f"exit code {code}; {log} ends with\n{last_lines(log)}")
+                raise RunFailedError(f"exit code {code}; {log} ends with", *last_lines(log))
     installed = versions()
     return {
         **result_row(job),
@@ -162,11 +159,11 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
         process.wait()
 
 
-def last_lines(log: Path) -> str:
+def last_lines(log: Path) -> list[str]:
     """Return the end of a log without progress bars."""
     text = log.read_text(encoding="utf-8", errors="replace")
     lines = [line.rsplit("\r", 1)[-1].rstrip() for line in text.split("\n")]
-    return "\n".join([line for line in lines if line][-LAST_LINES:])
+    return [line for line in lines if line][-LAST_LINES:]
 
 
 def gpu_name(slot: Slot) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,12 @@ def require_color(background: Tensor) -> None:
         raise UserInputError(f"background is a {type(background).__name__}, expected a (3,) Tensor: one RGB colour")
     if background.shape != (3,):
         raise UserInputError(f"background has shape {tuple(background.shape)}, expected (3,): one RGB colour")
+
+
+def render_values(rasterizer: Rasterizer, field: GaussianField, camera: Camera, values: Tensor) -> Tensor:
+    """Return values (n, 3) of the Gaussians blended as colours are, over zero: (3, height, width), differentiable."""
+    shown = replace(field, sh=(values / SH_C0)[:, None], signed=True)
+    return rasterizer.render_image(shown, camera, background=torch.zeros(3).to(values), sh_degree=0)
 
 
 @torch.no_grad()

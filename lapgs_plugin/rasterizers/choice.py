@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Container, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 RASTER_SETTINGS = "raster"
 """Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
 
-OWN: dict[str, type[Rasterizer]] = {**CPU_RASTERIZERS, gsplat.NAME: gsplat.GsplatRasterizer}
+OWN: dict[str, type[Rasterizer]] = {gsplat.NAME: gsplat.GsplatRasterizer, **CPU_RASTERIZERS}
 RASTERIZERS: Registry[type[Rasterizer]] = Registry(
     "--rasterizer", "lapgs_plugin.rasterizers", Rasterizer, OWN, classes=True
 )
@@ -81,24 +82,16 @@ def _raster_settings(manifest: Manifest) -> dict[str, Any]:
 
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
     """Return the available rasterizer that is most similar to that of the training, and the reason."""
-    same = "as in training"
-    failed = ""
-    if trained in package_rasterizers():
+    on_gpu, obstacle = device != "cpu" and torch.cuda.is_available(), ""
+    if on_gpu or trained in RASTERIZERS:  # on a CPU an extension has a stand-in only, which is slow
         try:
-            return _named(trained, device, settings), same
-        except UserInputError as error:
-            failed = f", because {error}"
-    if trained in CPU_RASTERIZERS and device != "cuda":
-        return _named(trained, "cpu", settings), same
-    if device == "cpu" or not torch.cuda.is_available():
-        place = "on the CPU" if device == "cpu" else "without a CUDA device"
-        return _named("cpu", "cpu", settings), f"the fastest {place}{failed}"
-    obstacle = f"{trained} runs on the CPU only"
-    if trained not in CPU_RASTERIZERS:
-        try:
-            return _named(trained, "cuda", settings), same
+            return _named(trained, device, settings), "as in training"
         except LapgsError as error:
-            obstacle = str(error)
+            obstacle = str(error).partition("; ")[0]  # without advice: another one renders
+    if not on_gpu:
+        place = "on the CPU" if device == "cpu" else "without a CUDA device"
+        failed = "" if trained in OWN or not obstacle else f", because {obstacle}"
+        return _named("cpu", "cpu", settings), f"the fastest {place}{failed}"
     reason = gsplat.missing()
     if not reason:
         return _named(gsplat.NAME, "cuda", settings), obstacle
@@ -109,39 +102,35 @@ def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tup
 
 def _named(name: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
     """Return the rasterizer of a name with the settings that it has."""
-    if name in CPU_RASTERIZERS:
-        if device == "cuda":
-            raise UserInputError(f"--rasterizer {name} --device cuda: it runs on the CPU; leave --device out")
-        return PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), settings)
-    if name == gsplat.NAME:
-        if device == "cpu":
-            raise UserInputError(f"--rasterizer {name} --device cpu: it runs on CUDA only; leave --device out")
-        known, unsupported = _split(settings, {"antialiasing"})
-        return PlacedRasterizer(gsplat.GsplatRasterizer(**known), torch.device("cuda"), unsupported)
     owners = rasterizer_owners()
     if name in owners:
         return _extension(name, owners[name].info.stand_in, device, settings)
-    if name in package_rasterizers():
-        return replace(package_rasterizer(name, device), unsupported=settings)
-    raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*RASTERIZERS, *owners])}")
+    if name not in RASTERIZERS:
+        raise UserInputError(f"--rasterizer {name}: expected auto, {', '.join([*RASTERIZERS, *owners])}")
+    return placed_rasterizer(name, device, settings)
 
 
-def package_rasterizers() -> tuple[str, ...]:
-    """Return the names of the rasterizers that installed packages bring."""
-    return tuple(name for name in RASTERIZERS if name not in OWN)
+def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, Any] | None = None) -> PlacedRasterizer:
+    """Return a rasterizer of `RASTERIZERS`, and the first of its devices that is there and asked for.
 
-
-def package_rasterizer(name: str, device: str = "auto") -> PlacedRasterizer:
-    """Return the rasterizer that an installed package brings under a name, and its device.
+    Args:
+        name: of the rasterizer.
+        device: "cuda", "cpu" or "auto".
+        settings: of a run; it is made with those that it has arguments for.
 
     Raises:
         UserInputError: it cannot be made, has another name, or does not render on the device; the line names it.
+        MissingExtraError: this package's needs what is not installed.
     """
     kind = RASTERIZERS[name]
-    label = f"--rasterizer {name}: {kind.__module__}.{kind.__qualname__}"
+    label = f"--rasterizer {name}" if name in OWN else f"--rasterizer {name}: {kind.__module__}.{kind.__qualname__}"
     try:
-        made = kind()
-    except Exception as error:  # any error of a package's code must name the package
+        known, unsupported = _split(settings or {}, inspect.signature(kind).parameters)
+        made = kind(**known)
+    except Exception as error:
+        if name in OWN:
+            raise
+        # Whatever a package's code does wrong, the user must learn which package it was.
         raise UserInputError(
             f"{label} cannot be made without arguments: {typed_line(error)}; fix or uninstall its package"
         ) from error
@@ -152,7 +141,7 @@ def package_rasterizer(name: str, device: str = "auto") -> PlacedRasterizer:
     if not usable:
         place = "this machine has no CUDA device" if device == "auto" else f"not on --device {device}"
         raise UserInputError(f"{label} renders on {' or '.join(made.devices)}, {place}; choose another rasterizer")
-    return PlacedRasterizer(made, torch.device(usable[0]), {})
+    return PlacedRasterizer(made, torch.device(usable[0]), unsupported)
 
 
 def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
@@ -173,7 +162,7 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
     return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
 
 
-def _split(settings: Mapping[str, Any], known: frozenset[str] | set[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _split(settings: Mapping[str, Any], known: Container[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split settings into known and other ones."""
     inside = {name: value for name, value in settings.items() if name in known}
     return inside, {name: value for name, value in settings.items() if name not in known}

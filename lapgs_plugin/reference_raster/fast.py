@@ -31,6 +31,7 @@ class CpuRasterizer(Rasterizer):
     """
 
     name = "cpu"
+    devices = ("cpu",)
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None

@@ -95,6 +95,7 @@ class OracleRasterizer(Rasterizer):
     """
 
     name = "oracle"
+    devices = ("cpu",)
 
     def __init__(self, *, three_sigma_cut: bool = True) -> None:
         self._three_sigma_cut = three_sigma_cut

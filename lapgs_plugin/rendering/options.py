@@ -12,7 +12,9 @@ from lapgs_plugin.options import option
 class RenderOptions:
     """Choose where a run's scene is, and where and with which rasterizer the run is rendered."""
 
-    scene: Path | None = option(None, "Scene folder, if it was moved after training.")
+    scene: Path | None = option(
+        None, "Scene folder, if it was moved after training, or a scene of other photos in the same coordinates."
+    )
     device: str = option("auto", "cuda, cpu, or auto: CUDA if there is a CUDA device, else the CPU.")
     rasterizer: str = option(
         "auto",

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lapgs_plugin.errors import RunFolderError
+import torch
+
+from lapgs_plugin.errors import RunFolderError, SceneError, errors_about
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.pose import corrected
-from lapgs_plugin.files import is_folder
+from lapgs_plugin.files import MANIFEST, is_folder
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.limits import FRAMES
 from lapgs_plugin.rasterizers.choice import rasterizer_for
@@ -72,9 +74,29 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
             f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
             "put them back"
         )
-    scene = load_reference(replace(reference, path=str(path)))
+    with errors_about(archive.path(MANIFEST)):
+        scene = load_reference(replace(reference, path=str(path)))
     require_same_scene(archive, scene.path, scene.smallest_size)
     return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
+
+
+def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
+    """Return whether a scene has none of the photos that a run was trained on; False if these are not there any more.
+
+    Args:
+        archive: the run.
+        scene: as `run_scene` returned it.
+    """
+    try:
+        trained, held_out = run_cameras(archive)
+    except (RunFolderError, SceneError):
+        return False  # it was moved, and `scene` is where it is now
+    own = {**trained, **held_out}
+    views = (*scene.train, *scene.test)
+    return not any(
+        view.name in own and torch.allclose(own[view.name].world_to_camera, view.camera.world_to_camera)
+        for view in views
+    )
 
 
 def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict[str, Camera], dict[str, Camera]]:
@@ -84,7 +106,8 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
         As `run_scene`.
     """
     reference, path = _scene_folder(archive, moved_to)
-    train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
+    with errors_about(archive.path(MANIFEST)):
+        train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
     return refined(archive, train), refined(archive, test)
 

@@ -9,9 +9,10 @@ from typing import Any
 
 from lapgs_plugin.evaluation.lpips import lpips_titles
 from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.results import MEASURED
 
 Metrics = dict[str, Any]
-"""Content of metrics.json, see `figures.run_figures`."""
+"""Content of metrics.json, see `evaluation.figures`."""
 
 OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
@@ -51,7 +52,7 @@ class Row:
 
 def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     """Return the rows for the metrics of a run, and then of its baseline if there is one."""
-    views = "held-out" if metrics[0]["split"] == "test" else "training"
+    views = MEASURED[metrics[0]["split"]]
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),

@@ -36,6 +36,7 @@ from lapgs_plugin.reports.comparison import Metrics, comparison_rows, setup_diff
 from lapgs_plugin.reports.pictures import Strip, make_strip
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
+from lapgs_plugin.runs.results import MEASURED
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"
@@ -92,6 +93,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         scene=Path(run.archive.manifest.scene.path).name,
         manifest=run.archive.manifest,
         metrics=run.metrics,
+        measured=MEASURED[run.metrics["split"]],
         baseline_name=baseline.name if baseline else None,
         differences=setup_differences(run.archive.manifest, baseline.archive.manifest) if baseline else [],
         rows=comparison_rows([each.metrics for each in runs]),

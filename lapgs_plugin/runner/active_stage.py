@@ -20,6 +20,7 @@ from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_record import StageRecord
 from lapgs_plugin.runner.stage_views import StageViews
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -103,6 +104,8 @@ class ActiveStage:
     def optimizers_made(self, gaussians: Any) -> None:
         """Prepare the optimizers that the checkout has just set up, some in the middle of a stage again."""
         self._model.prepare_optimizers(gaussians, inherit=self.iteration == 0)
+        if self._joint is not None:
+            self._joint.follow(gaussians, self._options.color_factor)
 
     def iteration_begins(self, gaussians: Any) -> None:
         """Do everything that comes before the next iteration, and count it: the stage's first is 1."""
@@ -147,6 +150,7 @@ class ActiveStage:
         """
         self.begin()
         self._call.run()
+        self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 
     def begin(self) -> None:
@@ -155,6 +159,26 @@ class ActiveStage:
         self.record.start()
         self._context.hooks.stage_begins(self.stage, self._views.rendering)
         self._context.watcher.stage_started(self.stage)
+
+    def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
+        """Check that the script's call, which has returned, trained this stage, the last one that it trains.
+
+        Args:
+            done, total: iterations of the call that were seen, and those that it was asked for.
+            ended: whether it got as far as to the last stage.
+
+        Raises:
+            LapgsError: no iteration of the stage was seen, or the call returned before the last stage.
+        """
+        name = self._call.function.__name__
+        if not ended or self.iteration == 0:
+            raise LapgsError(
+                f"{name}() ended after {done} of {total} iterations, in level {self.stage.level}; expected one call of "
+                f"{CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run --off`, or "
+                "with as many --iterations as it runs"
+            )
+        if done != total:
+            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, done, total)
 
     def finish(self) -> StageResult:
         """Archive the field after the stage's last iteration.

@@ -102,6 +102,7 @@ class HierarchyDriver:
             measuring=measuring,
         )
         self._replacements = StageReplacements(self._context, self._train)
+        self._since: int | None = None  # when the script's main block began, as files have it
         self.folder: Path | None = None
 
     def run(self) -> None:
@@ -110,6 +111,7 @@ class HierarchyDriver:
         Raises:
             LapgsError: the checkout, its options, the scene and the hierarchy do not go together.
         """
+        self._since = _now_in_files()
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
@@ -120,10 +122,10 @@ class HierarchyDriver:
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
         self._adapter.refuse(call, self._has_residuals)
-        require_pruning(call, self._options.prune)
+        require_pruning(call, self._options.prune, self._adapter.profile.model)
         folder = Path(call.dataset.model_path or _default_folder()).absolute()
         if not self._resume:
-            RunArchive.require_room(folder, self._overwrite)
+            RunArchive.require_room(folder, self._overwrite, self._since)
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._context.images.read_masks(Path(call.dataset.source_path), self._options.masks)
@@ -213,7 +215,7 @@ class HierarchyDriver:
             RunFolderError: it is in use, or was started with other options.
         """
         if not self._resume:
-            return RunArchive.create(folder, manifest, self._overwrite)
+            return RunArchive.create(folder, manifest, self._overwrite, self._since)
         archive = RunArchive.open(folder, resume=True)
         try:
             require_same_run(archive.manifest, manifest)
@@ -249,6 +251,12 @@ def between_events(plan: StagePlan, schedule: Schedule, variables: Mapping[str, 
 def _variables(call: TrainingCall) -> dict[str, Any]:
     """Return what a call's function sees by name: globals and arguments."""
     return {**inspect.unwrap(call.function).__globals__, **call.values}
+
+
+def _now_in_files() -> int:
+    """Return the present time as new files have it, whose clock is behind `time.time_ns`, in nanoseconds."""
+    with tempfile.TemporaryFile() as file:
+        return os.fstat(file.fileno()).st_mtime_ns
 
 
 def _default_folder() -> str:

@@ -6,7 +6,6 @@ random numbers, the script's arguments and its output are as if nothing had run.
 
 from __future__ import annotations
 
-import copy
 import io
 import logging
 import random
@@ -25,6 +24,7 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.checkouts.level_views import shrunk
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -151,9 +151,8 @@ class DryRun:
         if self._stage.signed:
             call = self._adapter.stage_call(self._call, self._context.window(self._plan, self._stage), str(folder))
         else:
-            values = {role: copy.copy(self._call.values[name]) for role, name in self._call.roles.items()}
-            values["dataset"].model_path = str(folder)
-            call = self._call.changed(**values)
+            call = self._call.copied()
+            call.dataset.model_path = str(folder)
         return call.listing(lambda _: [])
 
     def _scene_for(self, call: TrainingCall, gaussians: Any) -> Any:
@@ -165,14 +164,9 @@ class DryRun:
     def _view(self, camera: Any) -> Any:
         """Return a camera at the level of the tried stage."""
         images, device = self._context.images, self._context.device
-        key = images.key(camera)
-        width, height = level_size(images[key].size, self._stage.level)
-
-        def image() -> Tensor:
-            whole = images[key].load(device)[None]
-            return torch.nn.functional.interpolate(whole, (height, width), mode="area")[0]
-
-        return self._adapter.view_at(camera, (width, height), self._stage.signed, image)
+        image = images[images.key(camera)]
+        size = level_size(image.size, self._stage.level)
+        return self._adapter.view_at(camera, size, self._stage.signed, lambda: shrunk(image.load(device), size))
 
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
         """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""

@@ -27,13 +27,12 @@ from typing_extensions import NotRequired
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import BARE_RECORD, one_line_errors
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
-from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runner.manifest import scene_reference
 from lapgs_plugin.runs.archive import RunArchive
@@ -226,10 +225,8 @@ def import_run(
     RunArchive.require_room(out, overwrite)
     manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
     scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
-    try:
+    with errors_about(run.folder / CFG_ARGS):
         size = smallest_size(manifest.scene.path, **scene_options)
-    except UserInputError as error:  # most often about values of cfg_args
-        raise type(error)(f"{run.folder / CFG_ARGS}: {error}") from error
     fields = {level.level: _field(level, manifest.levels, backbone) for level in run.levels}
     with RunArchive.create(out, manifest, overwrite) as archive:
         seconds, peak = 0.0, 0
@@ -303,8 +300,7 @@ def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str
 
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     for name, value in settings.items():
-        wanted = {"mult": (int, float), "antialiasing": (bool,)}.get(name)
-        if wanted is None or name not in CONSTANTS or type(value) not in wanted:
+        if type(value) not in {"mult": (int, float), "antialiasing": (bool,)}.get(name, ()):
             raise UserInputError(f"--set {name}={value}: expected mult=NUMBER or antialiasing=true|false")
     return settings
 

@@ -11,12 +11,12 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runner.signed_calls import signed_settings
@@ -28,13 +28,13 @@ class _RendererCall:
     """Hold what a renderer was called with, and whether it has rasterized the model's colours.
 
     Attributes:
-        function: the renderer.
+        way: the renderer, and whether its arguments ask it to evaluate SH itself; None outside of renderers.
         key: key of the view; None for other cameras.
         given: values of each Gaussian (n, k) among its arguments, such as colours to render instead.
         done: not empty once the model's colours were rasterized.
     """
 
-    function: Callable[..., Any] | None = None
+    way: tuple[Callable[..., Any], bool] | None = None
     key: str | None = None
     given: tuple[Tensor, ...] = ()
     done: list[bool] = field(default_factory=list)
@@ -56,6 +56,9 @@ class RasterizerWrapper:
         self.rendering: StageRendering | None = None
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
+        # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
+        # probe of signed colour find them before a stage trains.
+        self._ways_of_sh: set[Any] = set()
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
@@ -65,7 +68,8 @@ class RasterizerWrapper:
             outer, given = self.running, (*args, *kwargs.values())
             key = next((key for v in given if (key := view_key(v)) is not None), outer.key)
             values = tuple(v for v in given if isinstance(v, Tensor) and v.ndim == 2)
-            self.running = _RendererCall(original, key, (*outer.given, *values))
+            way = original, any(getattr(v, "convert_SHs_python", False) is True for v in given)
+            self.running = _RendererCall(way, key, (*outer.given, *values))
             try:
                 return original(*args, **kwargs)
             finally:
@@ -73,9 +77,15 @@ class RasterizerWrapper:
 
         return render
 
-    def renderers(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout holds its renderers, as owners and names, each with its replacement's maker."""
-        return [(*place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+    def replacements(self, profile: Profile, consumer: str) -> list[Replacement]:
+        """Return replacements where a checkout holds its renderers, and looks rasterizers and their settings up."""
+        found = [(place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+        for rasterizer in profile.rasterizers:
+            for name in (*rasterizer.settings, *rasterizer.entries):
+                make = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
+                make = self.settings if name in rasterizer.settings else make
+                found += [(place, make) for place in profile.places(rasterizer, name)]
+        return [Replacement(*place, make, consumer) for place, make in found]
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the settings' constructor."""
@@ -91,15 +101,6 @@ class RasterizerWrapper:
             return signed_settings(settings, rendering.path, self._zero_background) if rendering.signed else settings
 
         return make_settings
-
-    def entries(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout looks rasterizers up, as owners and names, each with its replacement's maker."""
-        return [
-            (*place, self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function)
-            for rasterizer in profile.rasterizers
-            for name in rasterizer.entries
-            for place in profile.places(rasterizer, name)
-        ]
 
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
@@ -135,7 +136,7 @@ class RasterizerWrapper:
                 self._mark("loss")
                 return outputs
 
-            if not _has_model_colors(inputs, running, rendering.renderers_of_sh):
+            if not _has_model_colors(inputs, running, self._ways_of_sh):
                 return rendering.render_other(marked, inputs, settings)
             return rendering.render(marked, inputs, settings, running.key)
 
@@ -148,22 +149,22 @@ class RasterizerWrapper:
         return self._zeros
 
 
-def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, renderers_of_sh: set[Any]) -> bool:
+def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, ways_of_sh: set[Any]) -> bool:
     """Return whether a rasterizer renders the model's colours, and not depths, opacities or features in their place.
 
-    The model's colours are its SH, or colours that the renderer evaluates them to. Then they are the first that it
-    renders: forks rasterize other values beside the image.
+    The model's colours are its SH, or colours that the renderer evaluates them to. Forks rasterize other values beside
+    the image. So of a renderer that passes on no SH, as far as is known, only the first colours are the model's.
 
     Args:
         inputs: of the rasterizer.
         running: the renderer's call in which it is called; noted there if these are the model's colours.
-        renderers_of_sh: renderers that have passed on SH; a renderer is added where it does.
+        ways_of_sh: of rendering in which SH have been passed on; that of the call is added where it does.
     """
     colors = [value for name, value in inputs.items() if "color" in name and isinstance(value, Tensor)]
-    if running.function is not None:
+    if running.way is not None:
         if not colors:
-            renderers_of_sh.add(running.function)
-        elif running.done or running.function in renderers_of_sh:
+            ways_of_sh.add(running.way)
+        elif running.done or running.way in ways_of_sh:
             return False
     if any(color is each for color in colors for each in running.given):
         return False

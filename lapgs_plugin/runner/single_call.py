@@ -7,7 +7,6 @@ on the backbone. Iterations are counted, because not every checkout says which o
 
 from __future__ import annotations
 
-import copy
 import logging
 import tempfile
 from collections.abc import Callable
@@ -18,13 +17,12 @@ import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS
-from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
-from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -74,9 +72,8 @@ class SingleCall:
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
-        dataset, opt = copy.copy(run.call.dataset), copy.copy(run.call.opt)
-        dataset.model_path = str(run.archive.path("level_0"))
-        self._call = run.call.changed(dataset=dataset, opt=opt)
+        self._call = run.call.copied()
+        self._call.dataset.model_path = str(run.archive.path("level_0"))
         self._stage: NestedStage | None = None
         self._advanced = False  # whether this call has trained more than one level
 
@@ -96,7 +93,8 @@ class SingleCall:
                 self._run_from(stage.window.start)
             else:
                 self._call.run()
-            self._require_trained(self._stage)
+            level, done = self._stage.stage.level, self._stage.window.start + self._stage.iteration
+            self._stage.require_trained(done, self._plan.iterations, ended=level == 0)
             self._stage.finish()
         except torch.cuda.OutOfMemoryError as error:
             raise self._stage.out_of_memory(error) from error
@@ -176,20 +174,3 @@ class SingleCall:
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
             self._call.changed(**dict.fromkeys(takes, str(path))).run()
-
-    def _require_trained(self, stage: ActiveStage) -> None:
-        """Check that the finest level was trained.
-
-        Raises:
-            LapgsError: no iteration was seen, or the call ended in a coarser level.
-        """
-        trained, total = stage.window.start + stage.record.iteration, self._plan.iterations
-        name = self._call.function.__name__
-        if stage.stage.level > 0 or stage.record.iteration == 0:
-            raise LapgsError(
-                f"{name}() ended after {trained} of {total} iterations, in level {stage.stage.level}; expected "
-                f"one call of {CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run "
-                "--off`, or with as many --iterations as it runs"
-            )
-        if trained != total:
-            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, trained, total)

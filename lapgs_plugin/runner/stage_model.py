@@ -15,6 +15,7 @@ from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext, StageResult
+from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import OPTIMIZER
 
@@ -41,9 +42,14 @@ class StageModel:
         field, self._kept = inherit(self._before.field, mode, self._options.inherit_ratio, generator)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
-        gaussians.create_from_pcd(
-            type(points)(points=positions, colors=grey, normals=np.zeros_like(positions)), *others
-        )
+        # What else a fork knows of each point of the scene, it does not know of these.
+        count, known = len(points.points), fields_of(points).items()
+        unknown = {
+            name: np.zeros((len(positions), *value.shape[1:]), value.dtype)
+            for name, value in known
+            if isinstance(value, np.ndarray) and value.shape[:1] == (count,)
+        }
+        gaussians.create_from_pcd(with_values(points, {**unknown, "points": positions, "colors": grey}), *others)
         if mode != "xyz":
             names = ["_rotation", "_scaling", "_opacity"]
             if mode == "full":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
@@ -24,13 +25,22 @@ def pruning_iteration(call: TrainingCall) -> int | None:
     return until if first < until < call.opt.iterations else None
 
 
-def require_pruning(call: TrainingCall, share: float) -> None:
-    """Check that densification ends within a run that is to be pruned then.
+def require_pruning(call: TrainingCall, share: float, model: type) -> None:
+    """Check that densification ends within a run that is to be pruned then, by a method of its model.
 
     Raises:
-        UserInputError: it does not, so that --prune would change nothing.
+        UserInputError: it does not, so that --prune would change nothing; or the method needs more than a mask.
     """
-    if share and pruning_iteration(call) is None:
+    if not share:
+        return
+    try:
+        inspect.signature(model.prune_points).bind(None, None)  # type: ignore[attr-defined]  # the fork's
+    except TypeError as error:
+        raise UserInputError(
+            f"--prune {share}: {model.__name__}.prune_points() of the checkout takes more than a mask ({error}); leave "
+            "--prune out"
+        ) from error
+    if pruning_iteration(call) is None:
         given = ", ".join(f"--{name} {getattr(call.opt, name, 'missing')}" for name in (*DENSIFICATION, "iterations"))
         raise UserInputError(
             f"--prune {share}: prunes when densification ends, which it does not in this run ({given}); expected an "

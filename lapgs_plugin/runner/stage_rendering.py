@@ -51,7 +51,6 @@ class StageRendering:
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
         capture: keep the last composed image, before exposure or clamping, in `captured`, and the rasterizer's inputs.
-        renderers_of_sh: renderers that have passed the model's SH on to a rasterizer.
     """
 
     signed: bool
@@ -65,7 +64,6 @@ class StageRendering:
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
     inputs: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    renderers_of_sh: set[Any] = field(default_factory=set, repr=False)
     _told: bool = field(default=False, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 

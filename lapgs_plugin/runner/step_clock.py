@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from typing import Any
@@ -18,11 +18,28 @@ CLOCK = "update_learning_rate"
 
 
 def has_clock(profile: Profile) -> bool:
-    """Return whether a checkout's loop calls `CLOCK` before its backward pass; some call it at an iteration's end."""
+    """Return whether a checkout's loop calls `CLOCK` in every iteration, before its backward pass.
+
+    Some call it at an iteration's end, some not while they warm up.
+    """
     calls = [node for node in ast.walk(profile.source.training) if isinstance(node, ast.Call)]
     methods = [(call.func.attr, call.lineno) for call in calls if isinstance(call.func, ast.Attribute)]
     first = dict(sorted(methods, key=lambda method: -method[1]))
-    return hasattr(profile.model, CLOCK) and first.get(CLOCK, 0) < first["backward"]
+    early = first.get(CLOCK, 0) < first["backward"]
+    return hasattr(profile.model, CLOCK) and early and _surely_calls_clock(profile.source.training.body)
+
+
+def _surely_calls_clock(statements: Iterable[ast.stmt]) -> bool:
+    """Return whether these statements call `CLOCK` whichever way their branches take; loops are taken to run."""
+    return any(map(_calls_clock, statements))
+
+
+def _calls_clock(statement: ast.stmt) -> bool:
+    if isinstance(statement, ast.If):
+        return _surely_calls_clock(statement.body) and _surely_calls_clock(statement.orelse)
+    if isinstance(statement, (ast.For, ast.While, ast.With, ast.Try)):
+        return _surely_calls_clock(statement.body)
+    return any(isinstance(node, ast.Attribute) and node.attr == CLOCK for node in ast.walk(statement))
 
 
 def steps_positions(optimizer: Optimizer, gaussians: Any) -> bool:

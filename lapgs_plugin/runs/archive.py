@@ -54,13 +54,16 @@ class RunArchive(RunFiles):
     require_room = staticmethod(require_room)
 
     @classmethod
-    def create(cls, path: Path | str, manifest: Manifest, overwrite: bool = False) -> RunArchive:
+    def create(
+        cls, path: Path | str, manifest: Manifest, overwrite: bool = False, since: int | None = None
+    ) -> RunArchive:
         """Start a run in a new or empty folder and lock it for writing.
 
         Args:
             path: the folder; created with its parents.
             manifest: without records.
             overwrite: replace a run that is already there. Only files of a run are removed.
+            since: nanoseconds as of `os.stat`; files written since then, by the calling program, may be there.
 
         Raises:
             RunFolderError: there is a run and `overwrite` is not given, the folder holds something else, another
@@ -69,12 +72,12 @@ class RunArchive(RunFiles):
         assert not manifest.records, "a new run has no finished level"
         folder = Path(path).absolute()
         Manifest.from_json(asdict(manifest))  # refuse now what could not be read after training
-        require_room(folder, overwrite)
+        require_room(folder, overwrite, since)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         archive = cls(folder, manifest, FolderLock.acquire(folder))
         try:
-            require_room(folder, overwrite)  # another process may have started one before the lock was ours
+            require_room(folder, overwrite, since)  # another process may have started one before the lock was ours
             with one_line_errors(folder):
                 # If this is interrupted, the folder holds the old run without its checkpoint, which the new run must
                 # never continue from, or an empty run, but never a manifest without its fields.

@@ -47,8 +47,11 @@ EXTENDED = "extended_{}.{}"
 """A file of a run after its extension to a number of iterations, until it replaces the file of that name."""
 
 
-def require_room(path: Path | str, overwrite: bool = False) -> None:
+def require_room(path: Path | str, overwrite: bool = False, since: int | None = None) -> None:
     """Check that `RunArchive.create` would accept the folder, before anything expensive is done. Writes nothing.
+
+    Args:
+        path, overwrite, since: as of `RunArchive.create`.
 
     Raises:
         RunFolderError: as `RunArchive.create`, except for problems that only writing shows.
@@ -67,11 +70,18 @@ def require_room(path: Path | str, overwrite: bool = False) -> None:
     with one_line_errors(folder, "read"):
         entries = list(folder.iterdir()) if folder.exists() else []
     # A run that was killed before its first manifest leaves these two.
-    strangers = [p.name for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+    others = [p for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+    with one_line_errors(folder, "read"):
+        strangers = [p.name for p in others if since is None or _oldest(p) < since]
     if strangers:
         raise RunFolderError(
             f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
         )
+
+
+def _oldest(path: Path) -> int:
+    """Return when a file, or the oldest file in a folder, was last written, in nanoseconds."""
+    return min(each.lstat().st_mtime_ns for each in (path, *path.rglob("*")))
 
 
 def exists(path: Path) -> bool:

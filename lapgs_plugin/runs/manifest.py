@@ -16,6 +16,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST, require_manifest
 from lapgs_plugin.hierarchy.inheritance import require_degree
 from lapgs_plugin.hierarchy.plan import MOST_LEVELS, Hierarchy, Stage
+from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.untrusted import STRICT, StrictWithMore, checked, read_json, shortened, usable_path
 
@@ -35,6 +36,12 @@ def _peak_and_images(values: dict[str, int]) -> dict[str, int]:
     if values and values.keys() != {"peak", "images"}:
         raise ValueError(f"{shortened(sorted(values))} are counted, expected peak and images, or nothing")
     return values
+
+
+def _known_grid(name: str) -> str:
+    if name not in (*GRIDS, MIXED_GRID):
+        raise ValueError(f"{shortened(name)} is no pixel grid, expected {' or '.join(GRIDS)}")
+    return name
 
 
 MemoryBytes = Annotated[dict[str, NonNegativeInt], AfterValidator(_peak_and_images)]
@@ -163,7 +170,7 @@ class Manifest:
 
     scene: SceneReference
     levels: int
-    grid: Name
+    grid: Annotated[str, AfterValidator(_known_grid)]
     supervision: Name
     inherit: Name
     sh_degree: Annotated[int, Field(ge=0, le=3)]

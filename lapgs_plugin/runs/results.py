@@ -12,6 +12,9 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.runs.manifest import MemoryBytes
 from lapgs_plugin.untrusted import Strict, StrictWithMore, read_json
 
+MEASURED = {"test": "held-out", "train": "training", "other": "another scene's"}
+"""What the measured views of `Metrics` are called, by their "split"."""
+
 
 class HistoryEntry(StrictWithMore):
     """One line of the history."""
@@ -62,14 +65,14 @@ class MetricsOfLevel(StrictWithMore):
 
 
 class Metrics(_Distances):
-    """The metrics of a run, as far as `evaluation.figures.run_figures` measured them."""
+    """The metrics of a run, as far as `evaluation.figures` describes them."""
 
     psnr: NotRequired[float]
     fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     lpips_missing: NotRequired[dict[str, str]]
     fps: NotRequired[NonNegativeFloat]
-    split: NotRequired[Literal["test", "train"]]
+    split: NotRequired[Literal["test", "train", "other"]]
     num_views: NotRequired[NonNegativeInt]
     views: NotRequired[list[MetricsOfView]]
     levels: NotRequired[dict[str, MetricsOfLevel]]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.ply import read_ply, scalar_names
-from lapgs_plugin.files import is_file
-from lapgs_plugin.scenes.images import image_size
+from lapgs_plugin.files import is_file, is_folder
+from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.source import (
     LARGEST,
+    PINHOLE_MODELS,
     UNDISTORT_HINT,
     Frame,
     SceneSource,
@@ -38,9 +39,8 @@ TRAIN_FILE = "transforms_train.json"
 TEST_FILE = "transforms_test.json"
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
-PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 SHORTEST_FOCAL = 1e-3
-"""Shortest focal length in sides of the image. Files with angles in other units than radians have shorter ones."""
+"""Shortest focal length in sides of the image."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -65,7 +65,8 @@ def has_transforms(path: Path) -> bool:
 def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
-    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file every eighth view.
+    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file those of its
+    lists `test_filenames` and `val_filenames`, or every eighth view.
     Without it, both files of a pair are trained on, as in 3DGS. If there is no PLY of points (`ply_file_path` or
     points3d.ply), 100,000 random grey points fill a cube around the point that the cameras look at.
 
@@ -78,14 +79,15 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
     if is_file(path / TRAIN_FILE):
-        values = _read_json(path / TRAIN_FILE)
+        file, values = TRAIN_FILE, _read_json(path / TRAIN_FILE)
         train, test = _read_pair(path, values, images, evaluate)
         radius = OBJECT_RADIUS
     else:
-        values = _read_json(path / SINGLE_FILE)
-        train, test = hold_out(_read_frames(path, SINGLE_FILE, values, images), evaluate)
+        file, values = SINGLE_FILE, _read_json(path / SINGLE_FILE)
+        frames = _read_frames(path, SINGLE_FILE, values, images)
+        train, test = hold_out(frames, evaluate, _chosen_for_tests(frames, values))
         radius = CAPTURE_RADIUS
-    points, colors = _read_points(path, values) or _random_points([*train, *test], radius)
+    points, colors = _read_points(path, file, values) or _random_points([*train, *test], radius)
     return SceneSource("transforms", train, test, points, colors)
 
 
@@ -99,6 +101,37 @@ def _read_pair(
     elif evaluate:
         raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
     return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
+
+
+def _chosen_for_tests(frames: list[Frame], values: Values) -> set[str]:
+    """Return the names of the frames that nerfstudio's lists of file names keep from training."""
+    lists = (values.get(f"{part}_filenames") for part in ("test", "val"))
+    chosen = {PurePosixPath(name) for each in lists if isinstance(each, list) for name in each if isinstance(name, str)}
+    pairs = zip(frames, values["frames"], strict=True)
+    return {frame.name for frame, each in pairs if PurePosixPath(each["file_path"]) in chosen}
+
+
+def mask_folder(path: Path) -> str | None:
+    """Return the folder of the masks that a transforms file names by `mask_path`, relative to the scene, or None.
+
+    Raises:
+        SceneError: the file is unreadable, or the masks are not in a folder of their own.
+    """
+    file = next((path / name for name in (TRAIN_FILE, SINGLE_FILE) if is_file(path / name)), None)
+    frames = [] if file is None else [frame for frame in _read_json(file)["frames"] if isinstance(frame, dict)]
+    masks, photos = (
+        {PurePosixPath(frame[key].replace("\\", "/")).parent for frame in frames if isinstance(frame.get(key), str)}
+        for key in ("mask_path", "file_path")
+    )
+    if not masks:
+        return None
+    folder = min(masks)
+    if len(masks) > 1 or folder in photos or not is_folder(path / folder):
+        raise SceneError(
+            f"{file}: its masks (mask_path) are named in {folder}, expected one folder of masks alone; give it with "
+            "--masks FOLDER, or use no masks (--masks none)"
+        )
+    return folder.as_posix()
 
 
 def _read_json(file: Path) -> Values:
@@ -119,7 +152,14 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
         if image.name in ("", "..") or image == Path(os.path.normpath(path)):
             raise SceneError(f"{where} names a folder, expected the name of its image; export the scene again")
         inside = os.path.normpath(path)
-        name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
+        if image.is_relative_to(inside):
+            name = image.relative_to(inside).as_posix()
+        elif is_file(image):
+            name = image.name
+        else:
+            raise SceneError(
+                f"{where} names {image}: no such image; put it there or choose another folder with --images"
+            )
         posed = {**values, **frame}
         _refuse_distortion(posed, where)
         if not ("w" in posed and "h" in posed):
@@ -131,8 +171,10 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
 
 
 def _refuse_distortion(values: Values, where: str) -> None:
-    model = values.get("camera_model", "OPENCV")
+    model = values.get("camera_model") or "OPENCV"
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
+    if np.any(values.get("distortion_params") or 0.0):
+        distortion["distortion_params"] = values["distortion_params"]
     if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
         terms = "".join(f", {key} = {value}" for key, value in distortion.items())
         raise SceneError(f"{where} has a distorted camera ({model}{terms}); {UNDISTORT_HINT}")
@@ -143,9 +185,9 @@ def _image_path(path: Path, file_path: str, images: str) -> Path:
     image = Path(os.path.normpath(path / file_path.replace("\\", "/")))
     if images != "images":
         image = path / images / image.name
-    if is_file(image) or not image.name:
+    if not image.name:
         return image
-    candidates = [image.with_name(image.name + suffix) for suffix in IMAGE_SUFFIXES]
+    candidates = [find_image(image.with_name(image.name + suffix)) for suffix in ("", *IMAGE_SUFFIXES)]
     return next((candidate for candidate in candidates if is_file(candidate)), image)
 
 
@@ -200,7 +242,12 @@ def read_camera(values: Values, where: str) -> Camera:
         raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export it again") from error
     if fx is None or fy is None:
         raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export it again")
-    for focal, side in ((fx, width), (fy, height)):
+    for axis, focal, side in (("x", fx, width), ("y", fy, height)):
+        angle = None if f"fl_{axis}" in values else values.get(f"camera_angle_{axis}")
+        if angle is not None and float(angle) > math.pi:
+            raise SceneError(
+                f"{where} has camera_angle_{axis} {float(angle):g}, expected radians, less than 3.14; export it again"
+            )
         if 0.0 < focal < SHORTEST_FOCAL * side:
             raise SceneError(
                 f"{where} has a focal length of {focal:g} pixels for {side:.6g} of the image, expected more than a "
@@ -218,24 +265,27 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
     return None
 
 
-def _read_points(path: Path, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
     named = values.get("ply_file_path")
     if named is not None and not isinstance(named, str):
-        raise SceneError(f"{path}: ply_file_path is {named!r}, expected the name of a file; export the scene again")
+        raise SceneError(
+            f"{path / transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
+        )
     file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
     if file is None:
         return None
+    subject = f"{path / transforms} names {file}" if named else f"{file}"
     try:
         element = read_ply(file)["vertex"]
     except (OSError, KeyError, ValueError) as error:
-        raise SceneError(f"{file}: not readable as a PLY of points ({error}); export or remove it") from error
+        raise SceneError(f"{subject}: not readable as a PLY of points ({error}); export or remove it") from error
     vertices, channels = element.data, POINT_COLORS
     lists = {prop.name for prop in element.properties} - scalar_names(element)
     if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
         raise SceneError(
-            f"{file}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number of "
-            "each point); export or remove it"
+            f"{subject}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number "
+            "of each point); export or remove it"
         )
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not set(channels) <= scalar_names(element):

@@ -18,15 +18,13 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
-from lapgs_plugin.scenes.source import UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out
+from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.source import PINHOLE_MODELS, UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out
 
 MODEL_FILES = ("cameras", "images", "points3D")
 
 UNIT_TOLERANCE = 1e-2
 """Largest difference of a quaternion's length from 1; COLMAP writes 17 digits."""
-
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
 
 
 def find_model(path: Path) -> Path | None:
@@ -83,12 +81,19 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
             f"{model}: the sparse model is incomplete, it has only {found}; "
             "expected cameras, images and points3D, all as .bin or all as .txt"
         )
-    check_whole(model) if suffix == "bin" else check_text(model)
+    names: dict[int, str] = {}
+    if suffix == "bin":
+        check_whole(model)
+    else:
+        names = check_text(model)
     try:
-        return pycolmap.Reconstruction(str(model))
+        reconstruction = pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
         reason = (disagreement(model) if suffix == "bin" else None) or f"its files do not agree: {joined(error)}"
         raise SceneError(f"{model}: the sparse model cannot be read ({reason}); copy or export it again") from error
+    for key, name in names.items():
+        reconstruction.images[key].name = name
+    return reconstruction
 
 
 def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
@@ -129,4 +134,4 @@ def _frame(model: Path, folder: Path, camera: Camera, image: pycolmap.Image) -> 
             f"{model}: the rotation of {name} is the quaternion ({numbers}), expected one of length 1; copy or export "
             "the model again"
         )
-    return Frame(name, folder / name, posed)
+    return Frame(name, find_image(folder / name), posed)

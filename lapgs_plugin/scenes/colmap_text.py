@@ -22,15 +22,19 @@ SHOWN = 60
 """Characters of a line that are quoted in a message."""
 
 
-def check_text(folder: Path) -> None:
-    """Check the numbers in the text files of a model, and that the ids they refer to exist.
+def check_text(folder: Path) -> dict[int, str]:
+    """Check the numbers in the text files of a model and that the ids they refer to exist. Return the images' names.
+
+    pycolmap ends a name at its first space.
 
     Raises:
         SceneError: a line is wrong.
     """
     cameras = _ids(folder / "cameras.txt", _check_camera)
-    images = _ids(folder / "images.txt", lambda line: _check_image(line, cameras), pairs=True)
+    names: dict[int, str] = {}
+    images = _ids(folder / "images.txt", lambda line: _check_image(line, cameras, names), pairs=True)
     _ids(folder / "points3D.txt", lambda line: _check_point(line, images))
+    return names
 
 
 class _Line:
@@ -97,7 +101,7 @@ def _check_camera(line: _Line) -> int:
     return key
 
 
-def _check_image(line: _Line, cameras: set[int]) -> int:
+def _check_image(line: _Line, cameras: set[int], names: dict[int, str]) -> int:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
     if len(line.words) < 10:
         line.refuse(expected)
@@ -109,6 +113,7 @@ def _check_image(line: _Line, cameras: set[int]) -> int:
         line.refuse("a rotation, the quaternion QW QX QY QZ of length 1")
     if camera not in cameras:
         line.refuse(f"the id of a camera in cameras.txt, there is no {camera}")
+    names[key] = line.text.split(maxsplit=9)[9]
     return key
 
 

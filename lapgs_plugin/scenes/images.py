@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import io
 import os
+import unicodedata
 from collections.abc import Iterator
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, joined
-from lapgs_plugin.files import is_file, whole_file
+from lapgs_plugin.files import is_file, is_folder, whole_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 
 JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
@@ -31,6 +34,36 @@ Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own limit is below that 
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
+
+
+def find_image(path: Path) -> Path:
+    """Return an image file, or else the only file beside it whose name differs in case or Unicode form alone.
+
+    Photos are renamed so on their way between cameras and operating systems. Without such a file it is `path`.
+    """
+    if is_file(path) or not is_folder(path.parent):
+        return path
+    alike = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns).get(_plain(path.name), [])
+    return alike[0] if len(alike) == 1 else path
+
+
+@lru_cache(maxsize=8)
+def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
+    """Return the files of a folder by `_plain` name; `changed` is the time of its last change."""
+    files: dict[str, list[Path]] = {}
+    with suppress(PermissionError):  # opening the image says so
+        for file in filter(is_file, folder.iterdir()):
+            files.setdefault(_plain(file.name), []).append(file)
+    return files
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def missing_image(path: Path, more: str = "") -> SceneError:
+    """Return the error for an image that is not there; `more` follows."""
+    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images")
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -276,7 +309,9 @@ def _open(path: Path) -> oiio.ImageInput:
             f"{LONGEST_NAME}; rename the photo and reconstruct or export again"
         )
     if not is_file(path):
-        raise SceneError(f"{path}: no such image; put it there or choose another folder with --images")
+        raise missing_image(path)
+    if str(path).encode(errors="replace").decode() != str(path):
+        raise SceneError(f"{path}: its name is not UTF-8; rename it and reconstruct or export again")
     require_readable(path)
     options = oiio.ImageSpec()
     # Without it, 8-bit colour is multiplied by alpha in 8 bits, which loses precision where alpha is small.

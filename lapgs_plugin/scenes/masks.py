@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import torch
 from PIL import Image
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.files import is_folder
+from lapgs_plugin.scenes.blender import mask_folder
 from lapgs_plugin.scenes.images import has_alpha, image_size, read_image, same_shape
 
 MASKS = "masks"
@@ -21,6 +22,11 @@ HEIC = (".heic", ".heif", ".hif")
 """Photos of phones that neither COLMAP nor OpenImageIO reads."""
 
 
+def has_photo_suffix(file: PurePath) -> bool:
+    """Return whether a file is a photo by its name."""
+    return file.suffix.lower() in (*SUFFIXES, *HEIC)
+
+
 def resolve_masks(scene: Path, setting: str) -> str:
     """Return what a value of --masks means for a scene: "none", "alpha", or a folder relative to the scene or absolute.
 
@@ -28,7 +34,7 @@ def resolve_masks(scene: Path, setting: str) -> str:
         UserInputError: there is no such folder.
     """
     if setting == AUTO:
-        return MASKS if is_folder(scene / MASKS) else NONE
+        return MASKS if is_folder(scene / MASKS) else mask_folder(scene) or NONE
     if setting in (NONE, ALPHA) or is_folder(scene / setting):
         return setting
     if not is_folder(Path(setting)):
@@ -39,17 +45,24 @@ def resolve_masks(scene: Path, setting: str) -> str:
 def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
 
-    The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder.
+    The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder. A
+    folder that holds all photos, such as images/, may be left out. Other folders are not searched: one that is named
+    by mistake may be a whole disk.
 
     Raises:
         SceneError: an image has no mask, or several.
     """
-    files = [file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES]
+    tops = {name[: name.find("/") + 1] for name in names}  # "" of a name without a folder
+    common = tops.pop() if len(tops) == 1 else ""
+    shorter = {name: name.removeprefix(common) for name in names}
+    parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
+    places = [place for parent in parents if is_folder(place := folder / parent)]
+    files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
     present: dict[str, list[Path]] = {}
     for file in sorted(files):  # cameras write .JPG, other programs .jpg
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
-    found = {name: _mask_of(folder, present, name) for name in names}
-    if missing := [name for name, path in found.items() if path is None]:
+    found = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
+    if missing := [shorter[name] for name, path in found.items() if path is None]:
         stem = _stem(missing[0])
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
@@ -89,7 +102,7 @@ def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | 
 
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
-    return path.with_suffix("").as_posix() if path.suffix.lower() in (*SUFFIXES, *HEIC) else name
+    return path.with_suffix("").as_posix() if has_photo_suffix(path) else name
 
 
 def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -13,11 +14,11 @@ from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.files import is_folder
+from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
-from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape
+from lapgs_plugin.scenes.images import image_size, missing_image, read_as_3dgs, read_image, same_shape
 from lapgs_plugin.scenes.masks import (
     ALPHA,
     AUTO,
@@ -25,6 +26,7 @@ from lapgs_plugin.scenes.masks import (
     NONE,
     alpha_mask,
     find_masks,
+    has_photo_suffix,
     read_mask,
     refuse_photos,
     resolve_masks,
@@ -204,19 +206,35 @@ def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
 
 def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     """Return the frames and points of a scene folder, after checks."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise SceneError(f"{path}: not UTF-8, as which images are opened by name; rename the folder") from error
     if not is_folder(path):
-        raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
+        raise SceneError(
+            f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json, or make one from "
+            "photos or a video with `lapgs prepare PHOTOS OUT`"
+        )
     if (model := find_model(path)) is not None:
         source = read_colmap(path, model, images, evaluate)
     elif has_transforms(path):
         source = read_transforms(path, images, evaluate)
     else:
         raise SceneError(
-            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; "
-            "make a scene from photos with `lapgs prepare PHOTOS OUT`"
+            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; {_what_to_give(path)}"
         )
     _check_source(path, source)
     return source
+
+
+def _what_to_give(path: Path) -> str:
+    """Return the advice for a folder that is no scene: the scene or the photos in it."""
+    folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
+        return f"give {scene}, which has one"
+    known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
+    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
+    return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 
 def _check_source(path: Path, source: SceneSource) -> None:
@@ -228,10 +246,11 @@ def _check_source(path: Path, source: SceneSource) -> None:
         raise SceneError(
             f"{path}: {counted(len(source.train), 'training view')}{held_out}, expected at least 2; {hint}"
         )
-    names = [frame.name for frame in frames]
-    if len(set(names)) < len(names):
-        double = next(name for name in names if names.count(name) > 1)
+    uses = Counter(each for frame in frames for each in (frame.name, frame.path))
+    if (double := next((each.name for each in frames if uses[each.name] + uses[each.path] > 2), None)) is not None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
+    if len(missing := [frame.path for frame in frames if not is_file(frame.path)]) > 1:
+        raise missing_image(missing[0], f" ({len(missing)} of {len(frames)} are missing)")
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
             # because renders are written under these names

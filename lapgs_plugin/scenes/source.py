@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,13 @@ from lapgs_plugin.fields.camera import Camera
 HOLD_OUT_EVERY = 8
 """With --eval, every eighth view in name order is held out, starting with the first, as in 3DGS."""
 
-UNDISTORT_HINT = "only pinhole images can be trained on; `lapgs prepare PHOTOS OUT` undistorts photos"
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
+
+UNDISTORT_HINT = (
+    "only pinhole images can be trained on; `lapgs prepare PHOTOS OUT` undistorts photos, as does COLMAP's "
+    "image_undistorter"
+)
 
 LARGEST = 1e12
 """Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
@@ -102,10 +108,15 @@ def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
-def hold_out(frames: Sequence[Frame], evaluate: bool) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """Return training and held-out frames in name order; none are held out unless `evaluate`."""
+def hold_out(
+    frames: Sequence[Frame], evaluate: bool, chosen: Collection[str] = ()
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Return training and held-out frames in name order: every eighth or those named; none unless `evaluate`."""
     ordered = in_name_order(frames)
     if not evaluate:
         return ordered, ()
-    train = tuple(frame for index, frame in enumerate(ordered) if index % HOLD_OUT_EVERY != 0)
-    return train, ordered[::HOLD_OUT_EVERY]
+    names = set(chosen) or {frame.name for frame in ordered[::HOLD_OUT_EVERY]}
+    return (
+        tuple(frame for frame in ordered if frame.name not in names),
+        tuple(frame for frame in ordered if frame.name in names),
+    )

@@ -7,9 +7,8 @@ import torch
 from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.rasterizers.choice import PlacedRasterizer, package_rasterizer, package_rasterizers
+from lapgs_plugin.rasterizers.choice import RASTERIZERS, PlacedRasterizer, placed_rasterizer
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
-from lapgs_plugin.reference_raster import CPU_RASTERIZERS
 from lapgs_plugin.training.settings import TrainSettings
 
 
@@ -23,7 +22,7 @@ def choose_rasterizer(name: str) -> str:
         MissingExtraError: there is a GPU, and PyTorch or gsplat cannot use it.
         UserInputError: an unknown name.
     """
-    known = (AUTO, gsplat.NAME, *CPU_RASTERIZERS, *package_rasterizers())
+    known = (AUTO, *RASTERIZERS)
     if name not in known:
         raise UserInputError(f"--rasterizer {name}: expected {', '.join(known[:-1])} or {known[-1]}")
     if name != AUTO:
@@ -58,10 +57,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
             own_radii=True,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
-    if name in CPU_RASTERIZERS:
-        placed = PlacedRasterizer(CPU_RASTERIZERS[name](), torch.device("cpu"), {})
-    else:
-        placed = package_rasterizer(name)
+    placed = placed_rasterizer(name)
     asked = {
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,

@@ -131,14 +131,13 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
     Raises:
         RunFolderError: it belongs to another strategy or field.
     """
-    sums = {name for name, first in fresh.items() if first is None}
-    right = state.keys() == fresh.keys() and len({state[name] is None for name in sums}) <= 1
+    right = state.keys() == fresh.keys()
     for name in fresh if right else ():
         value, first = state[name], fresh[name]
         if isinstance(first, Tensor):
             right = right and _is_finite(value, first.shape, first.dtype)
         elif first is None:
-            right = right and (value is None or _is_finite(value, torch.Size([count]), torch.float32))
+            right = right and (value is None or _has_rows(value, count))
         else:
             right = right and type(value) is type(first) and math.isfinite(value)
     if not right:
@@ -279,6 +278,11 @@ def _is_finite(value: Any, shape: torch.Size | None, dtype: torch.dtype) -> bool
         and value.dtype == dtype
         and bool(torch.isfinite(value).all())
     )
+
+
+def _has_rows(value: Any, count: int) -> bool:
+    """Return whether it is a tensor of so many rows, of any type, without NaN and inf."""
+    return isinstance(value, Tensor) and value.shape[:1] == (count,) and bool(torch.isfinite(value).all())
 
 
 def _described(value: Tensor) -> str:

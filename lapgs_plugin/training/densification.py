@@ -40,8 +40,8 @@ class DensityControl:
         opacity_weight, scale_weight: of the mean opacity and the mean standard deviation in the loss.
 
     Attributes:
-        state: statistics it keeps between iterations, for checkpoints: tensors, numbers, or None where there are no
-            sums over Gaussians, (n,), yet.
+        state: statistics it keeps between iterations, for checkpoints: numbers, tensors whose shapes stay, or None for
+            what becomes a tensor (n, ...) of one row a Gaussian.
     """
 
     def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:

@@ -9,12 +9,18 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hooks import HookDispatcher, StageContext
+from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.exposure import ViewExposures
+
+LossOf = Callable[[Tensor, GaussianField], Tensor]
+"""Computes the mean loss of some views from their renders, (3, h, w) or (b, 3, h, w), and the field rendered."""
 
 
 @dataclass
@@ -26,6 +32,7 @@ class ViewLosses:
         images: the targets.
         coarser: predict the views.
         hooks: compose, and compute losses.
+        rasterizer: renders more of the field for hooks that ask for it.
         exposures: colour transforms of the views; None without compensation of exposure.
         ssim_weight: share of SSIM in a loss.
     """
@@ -34,6 +41,7 @@ class ViewLosses:
     images: LevelImages
     coarser: CoarserLevels
     hooks: HookDispatcher
+    rasterizer: Rasterizer
     exposures: ViewExposures | None
     ssim_weight: float
 
@@ -42,28 +50,32 @@ class ViewLosses:
         """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
         return self.images.weights is None and self.hooks.is_plain(self.stage)
 
-    def plain(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return what computes the mean loss of some views from their renders."""
+    def plain(self, names: Sequence[str]) -> LossOf:
+        """Return the loss of some views without hooks."""
         target = self.images.targets.get_stored(*names)
         compose = self.coarser.adder(names)
-        return lambda rendered: photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)
+        return lambda rendered, _: photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)
 
-    def hooked(self, contexts: Sequence[StageContext], names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return what computes the mean loss of some views by all hooks from their renders.
+    def hooked(self, contexts: Sequence[StageContext], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
+        """Return the loss of some views by all hooks.
 
         Args:
             contexts: result of `contexts`.
-            names: of the views.
+            names, cameras: of the views.
         """
 
         def of(context: StageContext, shown: Sequence[str], image: Tensor) -> Tensor:
             return self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
 
-        def loss(rendered: Tensor) -> Tensor:
-            if len(contexts) == 1:
+        def loss(rendered: Tensor, field: GaussianField) -> Tensor:
+            if self.hooks.takes_batches:
                 return of(contexts[0], names, rendered)
-            losses = [of(*each) for each in zip(contexts, ([name] for name in names), rendered, strict=True)]
-            return torch.stack(losses).mean()
+            images = [rendered] if rendered.ndim == 3 else rendered
+            losses = []
+            for context, name, camera, image in zip(contexts, names, cameras, images, strict=True):
+                here = replace(context, field=FieldInTraining(field, camera, self.rasterizer))
+                losses.append(of(here, [name], image))
+            return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
 
         return loss
 

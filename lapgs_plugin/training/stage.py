@@ -27,7 +27,7 @@ from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
-from lapgs_plugin.training.losses import ViewLosses
+from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
@@ -114,7 +114,13 @@ class StageRun:
     def __post_init__(self) -> None:
         self._dropout = self.settings.dropout_for(len(self.views))
         self._losses = ViewLosses(
-            self.stage, self.images, self.coarser, self.hooks, self.exposures, self.settings.ssim_weight
+            stage=self.stage,
+            images=self.images,
+            coarser=self.coarser,
+            hooks=self.hooks,
+            rasterizer=self.rasterizer,
+            exposures=self.exposures,
+            ssim_weight=self.settings.ssim_weight,
         )
         self._scoring = FieldScoring(
             self.rasterizer, self.views, self._losses, self.poses, self.background, self.settings.seed, self.breakdown
@@ -286,16 +292,16 @@ class StageRun:
         last = iterations[-1]
         self.coarser.start_if_joint(last)
         views = [self._view(iteration) for iteration in iterations]
-        names = [view.name for view in views]
-        loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names)
+        names, cameras = [view.name for view in views], [view.camera for view in views]
+        loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names, cameras)
         self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
         shown = thinned(gaussians, self._dropout * self.schedule.progress_at(last))
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
-        rendered, result = self._render(shown, [view.camera for view in views], last)
+        rendered, result = self._render(shown, cameras, last)
         self.breakdown.mark("loss")
-        loss = loss_of(rendered)
+        loss = loss_of(rendered, shown)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         kept = loss.detach()
         if result is not None:
@@ -308,15 +314,15 @@ class StageRun:
         # The gradient of the sum of the views' losses; for one view, the default of `backward`.
         total.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
-        return _Launch(result, views[-1].camera, kept, last, len(views), self.num_optimized)
+        return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
-    def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Call the hooks that come before a render; return what computes the loss of some views from it."""
+    def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
+        """Call the hooks that come before a render; return the loss of some views by all hooks."""
         contexts = self._losses.contexts(iterations, names)
         for context in contexts:
             self.hooks.before_render(context)
         self._context = contexts[-1]
-        return self._losses.hooked(contexts, names)
+        return self._losses.hooked(contexts, names, cameras)
 
     def _render(
         self, gaussians: GaussianField, cameras: Sequence[Camera], iteration: int

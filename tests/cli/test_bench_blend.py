@@ -16,6 +16,7 @@ from tests.cli.commands import succeeding
     ("options", "message"),
     [
         (("--views", "1,no"), "--views '1,no': expected numbers of views such as 1,8"),
+        (("--views", "²"), "--views '²': expected numbers of views such as 1,8"),
         (("--sizes", "800"), "--sizes '800': expected"),
     ],
 )
@@ -31,7 +32,7 @@ def test_it_needs_a_gpu() -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("shapes", ["8x8", "8x8x4x3", "8x8x8x2", "32x4x1x4", "8xax4x2"])
+@pytest.mark.parametrize("shapes", ["8x8", "8x8x4x3", "8x8x8x2", "32x4x1x4", "8xax4x2", "²x8x4x2"])
 def test_shapes_that_fill_no_warp_are_refused(shapes: str) -> None:
     from lapgs_plugin.evaluation.bench_blend import parse_shapes
 

@@ -90,7 +90,7 @@ MANIFEST_DAMAGE: list[tuple[str, Any, str]] = [
     ("levels", 2.5, "expected a valid integer"),
     ("levels", None, "expected a valid integer"),
     ("levels", True, "expected a valid integer"),
-    ("grid", 3, "expected a valid string"),
+    ("grid", "x", "'x' is no pixel grid, expected camera or even"),
     ("sh_degree", 9, "expected less than or equal to 3"),
     ("seed", -1, "expected greater than or equal to 0"),
     ("rasterizer", None, "expected a valid string"),
@@ -200,7 +200,7 @@ METRICS_DAMAGE: list[tuple[str, Any, str]] = [
     ("train_seconds", "x", "train_seconds is 'x'"),
     ("lpips_missing", [], "lpips_missing is"),
     ("lpips_vgg", "x", "lpips_vgg is 'x'"),
-    ("split", "other", "split is 'other'"),
+    ("split", "some", "split is 'some'"),
     ("versions", 1, "versions is 1"),
 ]
 
@@ -256,6 +256,26 @@ def test_what_may_not_be_looked_at_is_one_line(run: Path, place: str, monkeypatc
         monkeypatch.setattr(owner, name, denied(getattr(owner, name)))
     for command in ("export", "render", "eval"):
         refused(rf"{run / place}.*Permission denied|Permission denied", command, run)
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        ("scene.resolution", "x", "--resolution 'x': expected 1k"),
+        ("scene.images", "/", "/.*: no such image"),
+        ("scene.masks", "x", "--masks x: no such folder"),
+        ("settings.split", "5", "--split has 1 shares, expected 2"),
+    ],
+)
+def test_the_file_is_named_that_says_how_the_scene_was_read(
+    run: Path, scene: Path, where: str, value: str, message: str
+) -> None:
+    """The user gave none of the options that messages about such a value name."""
+    change(run / MANIFEST, where, value)
+    if where in ("scene.resolution", "scene.images"):
+        refused(f"{run / MANIFEST}: {message}", "eval", run, "--device", "cpu")
+    change(run / MANIFEST, "records", json.loads((run / MANIFEST).read_text())["records"][:1])
+    refused(f"{run / MANIFEST}: {message}", "train", scene, "-o", run, "--resume", "--threads", "1")
 
 
 def test_a_file_in_the_place_of_a_levels_folder(run: Path) -> None:

@@ -21,6 +21,7 @@ from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.images import caption_height
+from lapgs_plugin.reports.comparison import comparison_rows
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
@@ -210,6 +211,21 @@ def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> N
         lapgs(command, run, "--scene", tmp_path / "new")
         with pytest.raises(SceneError, match="no such scene folder"):
             lapgs(command, run, "--scene", tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("hold_out", [False, True])
+def test_eval_says_that_views_are_of_another_scene(hold_out: bool, scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, hold_out=hold_out)
+    others = write_scene(tmp_path / "others", [f"others/{i:02d}.png" for i in range(9)])
+    output = lapgs("eval", run, "--scene", others)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert (metrics["split"], metrics["num_views"]) == ("other", 9)
+    assert "9 views of a scene that it was not trained on" in " ".join(output.split())
+    assert "TRAINING" not in output
+    assert comparison_rows([metrics])[0].label == "PSNR, another scene's views (dB)"
+    shutil.copytree(scene, tmp_path / "copy")  # the same photos elsewhere
+    lapgs("eval", run, "--scene", tmp_path / "copy")
+    assert json.loads((run / "metrics.json").read_text())["split"] == ("test" if hold_out else "train")
 
 
 def test_another_scene_is_refused(run: Path, tmp_path: Path) -> None:

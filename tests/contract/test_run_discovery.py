@@ -141,6 +141,19 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
+def test_roles_among_all_options_of_a_script(scene: Path, tmp_path: Path) -> None:
+    """As LightGaussian's distillation, which gets them besides, or a script that passes nothing else on."""
+    options = Namespace(source_path="scene", model_path="out", iterations=30, feature_lr=0.1, convert_SHs_python=True)
+    groups = SimpleNamespace(source_path="scene", model_path="out"), SimpleNamespace(iterations=30)
+    call = TrainingCall.bind(lambda args, dataset, opt: None, (options, *groups), {})
+    assert call.roles == {"dataset": "dataset", "opt": "opt", "pipe": "args"}
+    with loaded(STUBS["graphdeco"], scene, tmp_path) as adapter:
+        call = adapter.stage_call(TrainingCall.bind(lambda args: None, (options,), {}), WINDOW, "run/level_0")
+    own = call.values["args"]
+    assert (own.model_path, own.iterations, own.feature_lr, own.convert_SHs_python) == ("run/level_0", 20, 0.4, False)
+    assert (options.model_path, options.iterations) == ("out", 30), "the script's own are not changed"
+
+
 def test_options_in_a_global_variable_name_the_output_folder_of_the_call() -> None:
     """As DropGaussian's, whose dry run would otherwise write into the run's folder."""
     names: dict[str, Any] = {"args": Namespace(model_path="out", quiet=True), "other": Namespace(quiet=True)}
@@ -255,7 +268,7 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
 
 
-def test_doctor_says_that_a_model_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_model_that_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As of forks whose colours come from a network."""
     model = fork / "scene" / "gaussian_model.py"
     base, parameters = "class GaussianModel(GaussianBase):\n", ("_xyz", "_rotation", "_scaling", "_opacity")
@@ -267,7 +280,10 @@ def test_doctor_says_that_a_model_lacks_what_fields_have(fork: Path, capsys: pyt
     model.write_text(text.replace(base, roles), encoding="utf-8")
     lapgs("doctor", fork)
     shown = capsys.readouterr().out
-    assert len(re.findall(r"\(scene/gaussian_model.py:\d+\) have no _features_dc, _features_rest, from", shown)) == 2
+    why = r"\(scene/gaussian_model.py:\d+\) have no _features_dc, _features_rest, from"
+    assert len(re.findall(why, shown)) == 2
+    with pytest.raises(UserInputError, match=f"cannot be trained in levels: its Gaussians {why}.* --off"):
+        lapgs("run", "--device", "cpu", fork / "scripts" / "train.py")  # before packages, which would not help
 
 
 def test_doctor_says_that_images_of_several_sizes_have_no_levels(

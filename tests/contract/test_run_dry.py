@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import torch
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runner import dry_run
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runs.archive import RunArchive
@@ -88,10 +90,10 @@ FAILURES = {
         "        1 / 0\n        loss = (1.0 - opt.lambda_dssim)",
         r"dry run: the first iteration failed at train.py:\d+: ZeroDivisionError: division by zero; expected",
     ),
-    "no update_learning_rate": (
+    "no step": (
         "train.py",
         "        gaussians.update_learning_rate(iteration)\n",
-        "        assert iteration == 1, 'the dry run trains on'\n",
+        "        gaussians.optimizer.step = lambda: None\n",
         r"train.py:\d+: training\(\) began no iteration, expected one call of update_learning_rate",
     ),
     "residuals whose colours the renderer clamps": (
@@ -194,6 +196,43 @@ def test_what_a_renderer_does_in_training_alone_is_left_out_of_predictions_and_m
         drive(one, levels=1, dry_run=True)
     assert RunArchive.open(tmp_path / "run").manifest.complete
     assert not [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+
+
+def test_depths_that_are_rasterized_before_the_image_change_no_iteration(scene: Path, tmp_path: Path) -> None:
+    """Before a stage trains it is known which of the renderer's colours are the model's."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    renderer, call = checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py", "    rendered_image, radii, depth_"
+    text = renderer.read_text(encoding="utf-8")
+    depths = """\
+    depths = (pc.get_xyz @ viewpoint_camera.world_view_transform[:3, 2:3] + 1).repeat(1, 3).detach()
+    rasterizer(
+        means3D=pc.get_xyz,
+        means2D=torch.zeros_like(pc.get_xyz),
+        opacities=pc.get_opacity,
+        colors_precomp=depths,
+        scales=pc.get_scaling,
+        rotations=pc.get_rotation,
+    )
+"""
+    assert text.count(call) == 1
+    edited, calls = text.replace(call, depths + call), list[int]()
+
+    class Counting(StageHook):
+        def before_render(self, context: StageContext) -> None:
+            calls.append(context.iteration)
+
+    for folder, sources in (("plain", text), ("with_depths", edited)):
+        renderer.write_text(sources, encoding="utf-8")
+        script, options = checkouts / "graphdeco" / "train.py", ("--iterations", 6)
+        with (
+            captured(tmp_path, []),
+            loaded(STUBS["graphdeco"], scene, tmp_path / folder, *options, script=script) as one,
+        ):
+            drive(one, hierarchy="laplacian", hooks=(Counting(),))
+    plain, other = (RunArchive.open(tmp_path / name).field(0) for name in ("plain", "with_depths"))
+    for name, value in plain.parameters.items():
+        torch.testing.assert_close(other.parameters[name], value)  # worst seen: equal
+    assert calls == [1, 2, 1, 2, 3, 4] * 2
 
 
 @pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])

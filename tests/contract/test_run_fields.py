@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runner.context import StageResult
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runner.stage_model import StageModel
 from tests.contract.stub_runs import NAMES, STUBS, drive_residuals, loaded, run_hierarchy
 
 PARTS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -118,3 +124,28 @@ def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp
 
 def parameters(model: Any) -> list[tuple[dict[str, Any], Tensor]]:
     return [(group, group["params"][0]) for group in model.optimizer.param_groups]
+
+
+class Points(NamedTuple):
+    """Points of a fork that has no normals, and an error and a colour map besides."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    normals: None
+    errors: np.ndarray
+    palette: str
+
+
+def test_points_of_a_residual_have_what_a_fork_has_of_points() -> None:
+    given: list[Points] = []
+    points = Points(np.ones((7, 3)), np.ones((7, 3)), None, np.ones((7, 2), np.float32), "viridis")
+    context = SimpleNamespace(options=RunSettings(inherit="xyz"), adapter=None, device=None)
+    model = SimpleNamespace(create_from_pcd=lambda cloud, *others: given.append(cloud))
+    field = some_field(5)
+    stage, before = Stage(0, (8, 6), 20, signed=True), StageResult(field, None, {}, {})
+    StageModel(context, SimpleNamespace(points=points, others=(1.0,)), stage, before).initialise(model)  # type: ignore[arg-type]
+    (cloud,) = given
+    np.testing.assert_array_equal(cloud.points, field.means.double().numpy())
+    assert (cloud.colors == 0.5).all()
+    assert (cloud.normals, cloud.palette) == (None, "viridis")
+    np.testing.assert_array_equal(cloud.errors, np.zeros((5, 2), np.float32))

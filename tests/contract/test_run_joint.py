@@ -105,6 +105,30 @@ def test_without_a_share_they_stay_as_they_are(options: dict[str, Any], scene: P
         assert torch.equal(before.fields[1][part], value)
 
 
+def test_finished_fields_follow_optimizers_that_a_loop_makes_in_the_middle(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+    step, folder = joint._Follow.__call__, tmp_path / "run"
+    monkeypatch.setattr(joint._Follow, "__call__", lambda *given: (step(*given), steps.append(1)))
+    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, "--iterations", 30) as adapter:
+        model = adapter.train.GaussianModel
+        update, setup = model.update_learning_rate, model.training_setup
+
+        def training_setup(self: Any, training_args: Any) -> None:
+            self.training_args = training_args
+            setup(self, training_args)
+
+        def update_learning_rate(self: Any, iteration: int) -> Any:
+            if iteration == 15:
+                self.training_setup(self.training_args)
+            return update(self, iteration)
+
+        model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
+        drive_residuals(adapter, joint=0.5)
+    assert len(steps) == 9, "in iterations 11 to 19; after its last the checkout does not step"
+
+
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a scene for three levels with odd sizes at the second."""

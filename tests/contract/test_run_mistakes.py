@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -322,6 +323,26 @@ def test_a_folder_of_the_backbone_itself_is_not_written_over(scene: Path, tmp_pa
     run_bare(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 2)
     with pytest.raises(RunFolderError, match="is not empty and not a run"):
         run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run")
+
+
+def test_files_that_the_script_has_just_written_are_no_others(copy: Path, scene: Path, tmp_path: Path) -> None:
+    """As of forks whose main blocks save their arguments before they train."""
+    script, folder = copy / "graphdeco" / "train.py", tmp_path / "run"
+    call = "    training(\n        lp.extract(args)"
+    edit(script, call, f"    os.makedirs(args.model_path + '/log/args', exist_ok=True)\n{call}")
+
+    def run() -> None:
+        with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, "--iterations", 4, script=script) as own:
+            drive(own, levels=1)
+
+    (folder / "log").mkdir(parents=True)
+    (folder / "log" / "mine").touch()
+    os.utime(folder / "log" / "mine", (0, 0))
+    with pytest.raises(RunFolderError, match=r"is not empty and not a run \(it holds log\)"):
+        run()
+    shutil.rmtree(folder)
+    run()
+    assert RunArchive.open(folder).manifest.complete
 
 
 def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path) -> None:

@@ -244,15 +244,21 @@ def test_a_script_that_cannot_start_in_the_middle_says_so(scene: Path, tmp_path:
             drive(adapter, resume=True, **THIRDS)
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str, scene: Path, tmp_path: Path) -> None:
+WARMING_UP = "if iteration > 40: gaussians.update_learning_rate(iteration)"
+"""As in RAIN-GS, whose learning rates stay as they are while it warms up."""
+
+
+@pytest.mark.parametrize(("hierarchy", "instead"), [("nested", "pass"), ("laplacian", "pass"), ("nested", WARMING_UP)])
+def test_iterations_are_steps_where_nothing_says_when_they_begin(
+    hierarchy: str, instead: str, scene: Path, tmp_path: Path
+) -> None:
     """The loop leaves out the last step, and its densification replaces positions between a step and the next."""
     checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
     script = checkouts / "graphdeco" / "train.py"
     text = script.read_text(encoding="utf-8")
     call = "gaussians.update_learning_rate(iteration)"
     assert text.count(call) == 1
-    script.write_text(text.replace(call, "pass"), encoding="utf-8")
+    script.write_text(text.replace(call, instead), encoding="utf-8")
     contexts: list[tuple[int, int]] = []
 
     class Noting(StageHook):
@@ -261,7 +267,8 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(hierarchy: str,
 
     folder = tmp_path / "run"
     with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, script=script) as adapter:
-        without(adapter.profile.model, "update_learning_rate")
+        if instead == "pass":
+            without(adapter.profile.model, "update_learning_rate")
         drive(adapter, hooks=(Noting(),), hierarchy=hierarchy, dry_run=True, **THIRDS)
     archive = RunArchive.open(folder)
     assert [record.image_size for record in archive.manifest.records] == [(32, 24), (64, 48)]
@@ -331,18 +338,27 @@ def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(
     assert RunArchive.open(tmp_path / "run").available_levels == (1,)
 
 
-def test_a_loop_that_ends_early_says_where(scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("hierarchy", "iterations"), [("nested", 20), ("laplacian", 0), ("laplacian", 8)])
+def test_a_loop_that_ends_early_says_where(
+    hierarchy: str, iterations: int, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
         training = adapter.train.training
 
         @wraps(training)
         def short(**values: Any) -> None:
-            values["opt"].iterations = 20
+            values["opt"].iterations = iterations
             training(**values)
 
         adapter.train.training = short
-        with pytest.raises(LapgsError, match=r"ended after 20 of 90 iterations, in level 1; expected"):
-            drive(adapter, **THIRDS)
+        if iterations == 8:
+            drive(adapter, hierarchy=hierarchy, joint=0.0)
+            warned = [each.getMessage() for each in caplog.records if "expected" in each.getMessage()]
+            assert warned == [f"training() ran 8 iterations, expected {n} as --iterations says" for n in (30, 60)]
+            return
+        of = 90 if hierarchy == "nested" else 30
+        with pytest.raises(LapgsError, match=rf"ended after {iterations} of {of} iterations, in level 1; expected"):
+            drive(adapter, hierarchy=hierarchy, **THIRDS)
 
 
 def test_tamings_budget_is_the_whole_runs(run_of: Callable[[str], tuple[RunArchive, Seen]]) -> None:

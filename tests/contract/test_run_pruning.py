@@ -87,6 +87,17 @@ def test_pruning_needs_an_end_of_densification(scene: Path, tmp_path: Path) -> N
     assert not folder.exists()
 
 
+def test_pruning_needs_a_method_that_takes_a_mask_alone(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """FSGS and CoR-GS also pass the iteration."""
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
+        monkeypatch.setattr(adapter.profile.model, "prune_points", lambda self, mask, iter, most=None: None)
+        with pytest.raises(UserInputError, match=r"prune_points\(\) .* takes more than a mask \(.*'iter'\)"):
+            drive(adapter, prune=SHARE)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_stage_that_is_not_pruned_says_so(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """In 90 iterations densification ends at 18; in stages of 30 and 60 at 6 and 12, and it begins at 10."""
     folder, more = tmp_path / "run", ("--densify_from_iter", 10, "--densify_until_iter", 18)

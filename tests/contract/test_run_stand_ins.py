@@ -148,3 +148,20 @@ def test_functions_that_are_imported_decide_and_optional_imports_do_not(tmp_path
     (tmp_path / "renderer.py").write_text(renderer("diff_gaussian_rasterization"))
     assert fitting_stand_in(tmp_path, "graphdeco") == "3dgs-mcmc"
     assert {"3dgs-mcmc", "faster-gs"} <= set(FORKS)
+
+
+@pytest.mark.parametrize(
+    ("line", "unpacks"),
+    [
+        ("distances, neighbours = knn(points)", True),
+        ("scales = torch.log(knn(points)[0])", True),
+        ("scales = torch.log(knn(points))[0]", False),
+        ("scales = knn(points)[..., None]", False),
+        ("scales, rotations = torch.sqrt(knn(points)), 1", False),
+    ],
+)
+def test_whether_a_function_has_to_return_several_results_is_read_from_its_calls(
+    line: str, unpacks: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "train.py").write_text(f"{TRAIN}\n\ndef create(points):\n    {line}\n")
+    assert CheckoutSource.read(tmp_path / "train.py").unpacks("knn") == unpacks

@@ -9,10 +9,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -25,7 +27,7 @@ from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.hooks import HookDispatcher, StageContext, entry_point_hooks, hooks_line
+from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext, entry_point_hooks, hooks_line
 from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
@@ -83,15 +85,43 @@ def test_each_is_under_forty_lines(name: str) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_the_hook_adds_to_the_loss_of_residual_stages() -> None:
-    (hook,) = entry_point_hooks()
+    hook = entry_point_hooks()[1]
     assert type(hook).__name__ == "Smooth"
-    assert hooks_line() == "hooks of installed packages: smooth (my_extension.hooks:Smooth)"
+    both = "depth (my_extension.depth:Depth), smooth (my_extension.hooks:Smooth)"
+    assert hooks_line() == f"hooks of installed packages: {both}"
     image = torch.zeros(3, 6, 8)
     image[:, 3:] = 1.0  # one edge, across 8 of 5 * 8 vertical steps
     term = HookDispatcher([hook]).extra_loss(context(signed=True), image)
     assert isinstance(term, Tensor)
     assert term.item() == pytest.approx(1e-3 / 5)
     assert HookDispatcher([hook]).extra_loss(context(signed=False), image) is None
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_hook_compares_depths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One Gaussian at depth 2; known is 4 in the upper half of the image."""
+    monkeypatch.chdir(tmp_path)
+    hook = entry_point_hooks()[0]
+    means = torch.tensor([[0.0, 0.0, 2.0]], requires_grad=True)
+    points = lapgs_plugin.field_from_points(means.detach(), torch.full((1, 3), 0.5), 0)
+    field = points.with_parameters({"means": means, "log_scales": torch.zeros(1, 3)})
+    camera = lapgs_plugin.Camera(8, 6, 8.0, 8.0, 4.0, 3.0, torch.eye(4))
+    shown = FieldInTraining(field, camera, lapgs_plugin.CpuRasterizer())
+    here, image = replace(context(signed=False), field=shown), torch.rand(3, 6, 8)
+    assert hook.loss(here, image) is None
+    known = np.zeros((12, 16), np.float32)
+    known[:6] = 4.0
+    (tmp_path / "depths").mkdir()
+    np.save(tmp_path / "depths" / f"{here.view}.npy", known)
+    term = hook.loss(here, image)
+    assert term is not None
+    half = shown.depth()[1][:3].sum().item()  # a blended depth of twice the opacity, where four times is known
+    assert term.item() == pytest.approx(0.1 * half * (4 - 2) / 4 / 48)
+    term.backward()
+    assert means.grad is not None
+    assert means.grad[0, 2] < 0  # farther away it is better
+    assert hook.loss(replace(here, field=None), image) is None
+    assert hook.loss(replace(here, stage=context(signed=True).stage), image) is None
 
 
 @pytest.mark.usefixtures("installed")
@@ -204,7 +234,10 @@ def test_the_operation_is_one_kernel_on_a_gpu(tone: Any) -> None:
 def test_no_file_on_the_page_is_without_a_test() -> None:
     package = {
         "pyproject.toml",
-        *(f"my_extension/{name}.py" for name in ("hooks", "supervision", "backbone", "strategy", "rasterizer")),
+        *(
+            f"my_extension/{name}.py"
+            for name in ("hooks", "depth", "supervision", "backbone", "strategy", "rasterizer")
+        ),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}
     assert FILES.keys() == package | operation | {"patches/my-rasterizer.toml"}

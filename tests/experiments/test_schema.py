@@ -53,6 +53,8 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         ("levels = 1", "levles = 1", ("levles", "lapgs train", "did you mean levels?")),
         ("levels = 1", "fused_adam = true", ("fused_adam", "lapgs train")),
         ("levels = 1", "seed = 1", ("sets seed", "the experiment sets itself")),
+        ("levels = 1", "eval = false", ("sets eval", "the experiment sets itself")),
+        ("levels = 1", 'config = "run.toml"', ("sets config", "the experiment sets itself")),
         ('title = "X"', 'title = "X"\niterations = "many"', ("iterations", "'many'", "integer")),
         ('title = "X"', 'title = "X"\niterations = 0', ("iterations", "greater than or equal to 1")),
         ('title = "X"', 'title = "X"\nseeds = []', ("seeds",)),

@@ -62,6 +62,14 @@ def cell(table: ResultTable, row: int, column: str) -> Cell:
     return table.groups[0].rows[row].cells[column]
 
 
+def test_a_figure_that_is_no_number_is_named_with_its_run() -> None:
+    experiment = paper_experiment()
+    planned = plan_runs(experiment, Selection())
+    records = {run.spec.run_id: {**record(run), "run": run.spec.run_id, "psnr": "good"} for run in planned}
+    with pytest.raises(RunFolderError, match=rf"results of {planned[0].spec.run_id} have psnr 'good', expected a num"):
+        make_table(experiment, planned, records)
+
+
 def test_means_over_scenes_and_deviations_over_seeds() -> None:
     table = table_of(paper_experiment())
     minutes = cell(table, 0, "minutes")

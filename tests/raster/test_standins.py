@@ -474,6 +474,23 @@ def test_distances_to_three_neighbours() -> None:
     assert relative(found, squared.topk(3, largest=False).values.mean(1)) < 1e-6  # worst seen: 2.8e-8
 
 
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_neighbours_beside_their_distances(count: int) -> None:
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    points[5:12] = points[4:5]  # more at one position than are returned
+    distances, neighbours = stand_ins("taming", neighbours=True)["simple_knn._C"].distCUDA2(points)
+    assert torch.equal(distances, stand_ins("taming")["simple_knn._C"].distCUDA2(points))
+    assert (neighbours.shape, neighbours.dtype) == ((count, 3), torch.int32)
+    there = min(3, count - 1)
+    found, own = neighbours[:, :there].long(), torch.arange(count)[:, None]
+    assert not bool((found == own).any())
+    assert all(len(set(row)) == there for row in found.tolist())
+    squared = torch.cdist(points.double(), points.double()).square().fill_diagonal_(torch.inf)
+    nearest = squared.topk(there, largest=False).values
+    torch.testing.assert_close(squared.gather(1, found), nearest)  # worst seen: equal
+    assert not bool(neighbours[:, there:].any())
+
+
 def test_sparse_adam_moves_visible_rows_only() -> None:
     adam = module_of("fastgs").SparseGaussianAdam
     generator = torch.Generator().manual_seed(0)

@@ -30,8 +30,10 @@ class Camera(nn.Module):
         self.original_image = torch.full((3, HEIGHT, WIDTH), 0.5, device=data_device)
         self.image_width, self.image_height, self.resolution = WIDTH, HEIGHT, (WIDTH, HEIGHT)
         self.focal_x, self.focal_y, self.Cx, self.FoVx = 10.0, np.float32(12.0), 4.0, 0.7
+        self.fl_x, self.fl_y, self.cx, self.cy = 10.0, -1.0, 0.5, -1
         self.K = np.array([[10.0, 0, 4], [0, 12, 3], [0, 0, 1]])
         self.mask = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % WIDTH < WIDTH // 2
+        self.objects = torch.arange(HEIGHT * WIDTH, dtype=torch.uint8).reshape(HEIGHT, WIDTH)
         self.invdepthmap, self.depth_mask, self.depth_reliable = np.ones((HEIGHT, WIDTH), np.float32), None, True
         self.alpha_mask = torch.ones(1, HEIGHT, WIDTH)
         self.world_view_transform = torch.randn(4, 4, generator=torch.Generator().manual_seed(len(name)))
@@ -53,9 +55,13 @@ def test_attributes_follow_the_size_of_the_level() -> None:
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
     assert (view.image_width, view.image_height, view.resolution) == (4, 3, (4, 3))
     assert (view.focal_x, view.focal_y, view.Cx, view.FoVx) == (5.0, 6.0, 2.0, 0.7), "also a number of NumPy"
+    assert (view.fl_x, view.fl_y, view.cx, view.cy) == (5.0, -1.0, 0.5, -1), "shares of an image, and unknown numbers"
     assert view.K.tolist() == [[5, 0, 2], [0, 6, 1.5], [0, 0, 1]]
     assert view.mask.tolist() == [[[True, True, False, False]] * 3]
     assert view.invdepthmap.shape == (3, 4)
+    assert view.objects.dtype == torch.uint8
+    assert set(view.objects.flatten().tolist()) < set(camera.objects.flatten().tolist()), "labels have no averages"
+    assert (view.objects // WIDTH // 2 == torch.arange(3)[:, None]).all(), "each of its place"
     assert view.alpha_mask is None, "opaque"
     assert view.original_image.shape == (3, 3, 4)
     assert (camera.focal_x, camera.K[0, 0], camera.invdepthmap.shape) == (10.0, 10.0, (HEIGHT, WIDTH)), "unchanged"
@@ -164,7 +170,10 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
         return {name: function(means, *calls[name], made)[1] for name in order}
 
     if first == "depths":
-        render(view)  # it is known from then on that this renderer passes on SH
+        # It is known from the probe of signed colour on, in every later stage, that this renderer passes on SH.
+        stage, wrapper.rendering = wrapper.rendering, StageRendering(True, ColorPath.NATIVE, {}, capture=True)
+        render(view)
+        wrapper.rendering = stage
     found = render(view)
     assert wrapper.rendering.captured is not None
     assert found["image"].unique().tolist() == wrapper.rendering.captured.unique().tolist() == [0.375]

@@ -22,6 +22,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.checkpoint import check_densifier
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.training_runs import resume, train
@@ -190,6 +191,17 @@ def test_a_damaged_checkpoint_is_one_line(name: str, stopped: Path, scene: Scene
         assert (path.read_bytes(), (stopped / "history.jsonl").read_bytes()) == (damaged, history)
     finally:
         path.write_bytes(whole)
+
+
+def test_density_control_keeps_any_rows_of_gaussians() -> None:
+    """A strategy of another package has columns, whole numbers, and sums that begin later than others."""
+    fresh = {"sums": None, "later": None, "views": 0}
+    kept = {"sums": torch.zeros(5, 2), "later": None, "views": 3}
+    check_densifier(kept, fresh, 5, Path("checkpoint.pt"))
+    check_densifier({**kept, "later": torch.zeros(5, dtype=torch.int64)}, fresh, 5, Path("checkpoint.pt"))
+    for damaged in (torch.zeros(4, 2), torch.zeros(()), torch.full((5,), torch.nan), 0.5):
+        with pytest.raises(RunFolderError, match=r"densifier is not the state .* for 5 Gaussians"):
+            check_densifier({**kept, "sums": damaged}, fresh, 5, Path("checkpoint.pt"))
 
 
 def test_a_checkpoint_of_a_finished_level_is_reported(

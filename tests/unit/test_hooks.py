@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, fields
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ from torch import Tensor
 
 from lapgs_plugin import hooks as hooks_module
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import (
     Composition,
+    FieldInTraining,
     HookDispatcher,
     StageContext,
     StageHook,
@@ -26,6 +29,7 @@ from lapgs_plugin.hooks import (
     verify_hook,
 )
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.reference_raster import OracleRasterizer
 
 BASE = Stage(level=1, image_size=(16, 12), iterations=5, signed=False)
 RESIDUAL = Stage(level=0, image_size=(32, 24), iterations=9, signed=True)
@@ -211,7 +215,9 @@ def test_terms_of_the_loss_add_up_with_their_gradients() -> None:
 
 
 def test_a_hook_sees_no_more_than_the_context() -> None:
-    assert set(vars(context())) == {"stage", "iteration", "view", "target", "accumulated", "coarse_target", "weight"}
+    images = {"target", "accumulated", "coarse_target", "weight"}
+    assert set(vars(context())) == {"stage", "iteration", "view", "field"} | images
+    assert [each.name for each in fields(FieldInTraining)] == ["gaussians", "camera", "rasterizer"]
     with pytest.raises(FrozenInstanceError):
         context().iteration = 1  # type: ignore[misc]  # that it is refused is what is tested
 
@@ -355,3 +361,27 @@ def test_an_installed_package_is_found(tmp_path: Path, monkeypatch: pytest.Monke
     )
     monkeypatch.syspath_prepend(tmp_path)
     assert [type(hook).__name__ for hook in entry_point_hooks()] == ["Fancy"]
+
+
+def test_a_hook_renders_depths_with_gradients() -> None:
+    """The left Gaussian is 2 units away, the right one 3; neither reaches the other's half of the image."""
+    means = torch.tensor([[-1.0, 0.0, -3.0], [1.5, 0.0, -2.0]], dtype=torch.float64, requires_grad=True)
+    field = GaussianField(
+        means=means,
+        quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2, dtype=torch.float64),
+        log_scales=torch.full((2, 3), -2.0, dtype=torch.float64),
+        opacity_logits=torch.ones(2, dtype=torch.float64),
+        sh=torch.full((2, 4, 3), 9.0, dtype=torch.float64),
+    )
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 5.0  # the camera is 5 units behind the origin
+    shown = FieldInTraining(field, Camera(24, 16, 12.0, 12.0, 12.0, 8.0, pose), OracleRasterizer())
+    depth, opacity = shown.depth()
+    assert depth.shape == opacity.shape == (16, 24)
+    for half, distance in ((slice(0, 12), 2.0), (slice(12, 24), 3.0)):
+        assert opacity[:, half].max() > 0.4
+        torch.testing.assert_close(depth[:, half], distance * opacity[:, half])
+    (depth.sum() - 2.0 * opacity[:, :12].sum() - 3.0 * opacity[:, 12:].sum()).backward()
+    assert means.grad is not None
+    expected = torch.stack([opacity[:, :12].sum(), opacity[:, 12:].sum()])  # opacities' own changes cancel out
+    torch.testing.assert_close(means.grad[:, 2], expected.detach())

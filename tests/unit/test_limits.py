@@ -147,7 +147,7 @@ def test_names_are_printed_without_what_they_do_to_a_terminal() -> None:
     assert printable("a\x1b[2J\n\r\x07\x9b1m\u202egnp\ud800") == r"a\x1b[2J\n\r\x07\x9b1m\u202egnp\ud800"
     ordinary = "Größe 写真\u3000é [bold] C:\\x ~ 🙂"
     assert printable(ordinary) == ordinary
-    assert str(RunFailedError("it ends with\n\x1b[1mone\ntwo")) == "it ends with\n\\x1b[1mone\ntwo"
+    assert str(RunFailedError("it ends with", "\x1b[1mone", "two")) == "it ends with\n\\x1b[1mone\ntwo"
     for kind in (LapgsError, SceneError, UserInputError):
         assert str(kind("photo \x1b]0;x\x07.png\nlapgs: all is well")) == r"photo \x1b]0;x\x07.png\nlapgs: all is well"
 

@@ -123,8 +123,8 @@ def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: d
     [
         ("gpu", "auto", "--device gpu: expected auto, cuda, cpu"),
         ("cuda", "auto", "--device cuda: PyTorch finds no CUDA device"),
-        ("auto", "my_own", "--rasterizer my_own: expected auto, cpu, oracle, gsplat, diff_gaussian"),
-        ("cpu", "gsplat", "--rasterizer gsplat --device cpu: it runs on CUDA only"),
+        ("auto", "my_own", "--rasterizer my_own: expected auto, gsplat, cpu, oracle, diff_gaussian"),
+        ("cpu", "gsplat", "--rasterizer gsplat: PyTorch finds no CUDA device"),
         ("auto", "gsplat", "--rasterizer gsplat: PyTorch finds no CUDA device"),
     ],
 )
@@ -183,15 +183,17 @@ def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: 
 
 
 @pytest.mark.usefixtures("cuda")
-def test_the_device_decides_for_runs_of_either_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_device_decides_for_runs_of_either_kind(monkeypatch: pytest.MonkeyPatch, line: Any) -> None:
     monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
-    assert chosen(rasterizer_for(manifest("cpu"))) == ("cpu", "cpu")
     assert chosen(rasterizer_for(manifest("cpu"), device="cuda")) == ("gsplat", "cuda")
+    assert "with gsplat on A GPU: --rasterizer cpu renders on cpu, not on --device cuda; the run was" in line()
+    assert chosen(rasterizer_for(manifest("cpu"))) == ("cpu", "cpu")
+    assert rasterizer_for(manifest("gsplat", antialiasing=True), rasterizer="cpu").unsupported == {"antialiasing": True}
     with install("fastgs"):
         assert chosen(rasterizer_for(manifest(FASTGS), device="cpu")) == ("cpu", "cpu")
         assert chosen(rasterizer_for(manifest("cpu"), rasterizer=FASTGS)) == (FASTGS, "cuda")
         assert chosen(rasterizer_for(manifest(FASTGS), device="cpu", rasterizer=FASTGS)) == (FASTGS, "cpu")
-    with pytest.raises(UserInputError, match="--rasterizer cpu --device cuda: it runs on the CPU"):
+    with pytest.raises(UserInputError, match="--rasterizer cpu renders on cpu, not on --device cuda; choose"):
         rasterizer_for(manifest(FASTGS), device="cuda", rasterizer="cpu")
 
 

@@ -6,6 +6,7 @@ import logging
 import re
 import shutil
 import struct
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,7 +62,10 @@ class Model:
         lines = [f"{i + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0.5" for i, ((x, y, z), (r, g, b)) in enumerate(rows)]
         (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
         if binary:
-            pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+            model = pycolmap.Reconstruction(str(folder))
+            for index, name in enumerate(self.names):
+                model.images[len(self.names) - index].name = name  # pycolmap ends a text's name at its first space
+            model.write_binary(str(folder))
             for text in folder.glob("*.txt"):
                 text.unlink()
 
@@ -230,6 +234,28 @@ def test_model_directly_in_sparse(tmp_path: Path) -> None:
     assert len(load(path).train) == 10
 
 
+@pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
+def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: bool) -> None:
+    names = ("cam 1/IMG 01.png", "cam 1/Tür 2.png", "cam 2/x.JPG")
+    path = make_scene(tmp_path, Model(names), binary=binary)
+    (path / "images" / names[1]).rename(path / "images" / unicodedata.normalize("NFD", names[1]))
+    (path / "images" / names[2]).rename(path / "images" / "cam 2" / "X.jpg")
+    assert tuple(view.name for view in load(path).train) == names
+    (path / "images" / "cam 2" / "x.jpg").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"cam 2/x\.JPG: no such image; put it there"):
+        load(path)  # two files differ in case alone
+    (path / "images" / names[0]).unlink()
+    with pytest.raises(SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\)"):
+        load(path)
+
+
+def test_two_names_of_one_photo_are_refused(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(("a.png", "A.png", "c.png")))
+    (path / "images" / "A.png").unlink()
+    with pytest.raises(SceneError, match=r"image A\.png is listed twice"):
+        load(path)
+
+
 def test_photos_that_are_not_in_the_model_are_left_out(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
     (path / "images" / "unregistered.png").write_bytes(b"not even an image")
@@ -332,6 +358,22 @@ def test_neither_model_nor_transforms(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"neither a COLMAP model .* nor transforms\.json.*`lapgs prepare") as caught:
         load(tmp_path)
     assert_one_line(caught)
+
+
+@pytest.mark.parametrize("name", ["garden", "dense/0"])
+def test_a_folder_around_a_scene_is_told_where_it_is(tmp_path: Path, name: str) -> None:
+    (tmp_path / name / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / name / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+    with pytest.raises(SceneError, match=rf"neither .* in it; give \S+/{name}, which has one"):
+        load(tmp_path)
+
+
+def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
+    write_images(tmp_path, {"one.png": (8, 8), "keyframes/images/1.png": (8, 8)})
+    with pytest.raises(SceneError, match=r"make a scene from photos with `lapgs prepare \S+/keyframes/images OUT`"):
+        load(tmp_path)
+    with pytest.raises(SceneError, match=r"`lapgs prepare \S+/keyframes/images OUT`"):
+        load(tmp_path / "keyframes" / "images")
 
 
 def test_wrong_resolution_comes_first(tmp_path: Path) -> None:

@@ -147,6 +147,8 @@ def test_missing_intrinsics_have_the_usual_meaning(tmp_path: Path) -> None:
 def test_zero_distortion_is_no_distortion(tmp_path: Path) -> None:
     path = capture(tmp_path)
     edit(path, {"k1": 0.0, "k2": 0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "is_fisheye": False})
+    edit(path, {"camera_model": "SIMPLE_RADIAL", "distortion_params": [0.0] * 6}, in_frame=3)
+    edit(path, {"camera_model": "PINHOLE"}, in_frame=4)
     assert len(load(path).train) == 10
 
 
@@ -181,6 +183,32 @@ def test_single_file_holds_out_every_eighth(tmp_path: Path) -> None:
     assert scene.extent == pytest.approx(1.1 * radius, rel=1e-9)
 
 
+@pytest.mark.parametrize("part", ["test", "val"])
+def test_nerfstudios_lists_choose_the_views_that_are_held_out(tmp_path: Path, part: str) -> None:
+    path = capture(tmp_path)
+    edit(path, {f"{part}_filenames": ["./images/frame_002.png", "images/frame_003.png", "images/none.png"]})
+    scene = load(path, eval=True)
+    assert [view.name for view in scene.test] == ["images/frame_002.png", "images/frame_003.png"]
+    assert len(scene.train) == 8
+    assert len(load(path).train) == 10
+
+
+def test_nerfstudios_masks_are_used(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    for i in range(10):
+        edit(path, {"mask_path": f"holes/frame_{i:03d}.png"}, in_frame=i)
+    with pytest.raises(SceneError, match=r"its masks \(mask_path\) are named in holes, expected one folder"):
+        load(path)
+    assert load(path, masks="none").train[0].mask is None
+    write_images(path, [f"holes/frame_{i:03d}.png" for i in range(10)], (80, 60))
+    cv2.imwrite(str(path / "holes" / "frame_004.png"), np.repeat(np.eye(60, 80, dtype=np.uint8), 3).reshape(60, 80, 3))
+    masks = {view.name: view.mask for view in load(path).train}
+    assert bool(masks["images/frame_003.png"].all())
+    assert int(masks["images/frame_004.png"].sum()) == 60
+    (path / "holes").rename(path / "masks")
+    assert load(path).train[4].mask is not None
+
+
 def test_transparent_background(tmp_path: Path) -> None:
     path = nerf_scene(tmp_path)
     rgba = np.zeros((80, 80, 4), np.uint8)
@@ -201,10 +229,12 @@ def test_images_folder_replaces_the_one_of_the_frames(tmp_path: Path) -> None:
     assert scene.train[0].name == "images_2/frame_000.png"
 
 
-@pytest.mark.parametrize("name", ["images\\frame_000.png", "./images/frame_000", "images/frame_000"])
+@pytest.mark.parametrize("name", ["images\\frame_000.png", "./images/frame_000", "images/FRAME_000.PNG"])
 def test_ways_to_write_a_path(tmp_path: Path, name: str) -> None:
     path = capture(tmp_path)
     edit(path, {"file_path": name}, in_frame=0)
+    file = path / "transforms.json"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())  # some editors begin UTF-8 with it
     assert load(path).train[0].name == "images/frame_000.png"
 
 
@@ -312,7 +342,7 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ({"frames": [{"transform_matrix": [[1]]}]}, "frame 0 has no file_path"),
         ({"ply_file_path": "none.ply"}, r"none\.ply: not readable as a PLY"),
         ({"ply_file_path": "a" * 300}, "not readable as a PLY"),
-        ({"ply_file_path": "/"}, "/: not readable as a PLY"),
+        ({"ply_file_path": "/"}, r"transforms\.json names /: not readable as a PLY"),
         ({"ply_file_path": "\0"}, "not readable as a PLY"),
         (
             {"fl_x": 1e300},
@@ -320,6 +350,10 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ),
         ({"cx": -1e300}, r"principal point \(-1e\+300, 29.5\), expected at most"),
         ({"w": 1e19, "h": 1e19, "fl_x": 1e19, "fl_y": 1e19}, "1e.19 pixels wide or high, expected at most 2147483648"),
+        (
+            {"fl_x": None, "camera_angle_x": 40.0},
+            r"frame 0 .* has camera_angle_x 40, expected radians, less than 3\.14",
+        ),
         ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
         ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
         ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
@@ -357,7 +391,7 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
         ({"file_path": ""}, r"frame 4 \(\) names a folder"),
         ({"file_path": "images/.."}, "names a folder"),
         ({"file_path": "images"}, "images: no such image"),
-        ({"file_path": "../../elsewhere.png"}, r"elsewhere\.png: no such image"),
+        ({"file_path": "../../elsewhere.png"}, r"frame 4 .* names .*elsewhere\.png: no such image"),
         ({"file_path": "a\0b"}, r"a\\x00b: no such image"),
         ({"file_path": "\x1b[2Ja\nb\u202e.png"}, r"/\\x1b\[2Ja\\nb\\u202e\.png: no such image"),
         ({"file_path": "\ud800.png"}, "not readable as JSON"),
@@ -367,6 +401,7 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
             r"frame 4 .* has 1e\+300 in its transform_matrix, expected at most 1e\+12",
         ),
         ({"transform_matrix": (1e300 * np.eye(4)).tolist()}, r"frame 4 .* has 1e\+300 in its transform_matrix"),
+        ({"distortion_params": [0.1, 0.0]}, r"distorted camera \(OPENCV, distortion_params = \[0.1, 0.0\]\)"),
         ({"transform_matrix": None}, "frame 4 .* has no transform_matrix"),
         ({"transform_matrix": [[1, 2], [3]]}, "frame 4 .* has no transform_matrix"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "frame 4 .* has no transform_matrix"),

@@ -332,8 +332,10 @@ class Counter(StageHook):
     def __init__(self) -> None:
         self.calls: list[tuple[str, int, str]] = []
         self.shapes: set[tuple[int, ...]] = set()
+        self.cameras: dict[str, Camera] = {}
 
     def before_render(self, context: StageContext) -> None:
+        assert context.field is None
         self.calls.append(("before_render", context.iteration, context.view))
 
     def compose(self, context: StageContext, image: Tensor) -> Tensor:
@@ -343,12 +345,16 @@ class Counter(StageHook):
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor | None:
         self.calls.append(("loss", context.iteration, context.view))
+        assert context.field is not None
+        assert context.field.gaussians.means.requires_grad
+        self.cameras[context.view] = context.field.camera
         return None
 
     def after_backward(self, context: StageContext) -> None:
         self.calls.append(("after_backward", context.iteration, context.view))
 
     def on_densify(self, context: StageContext) -> None:
+        assert context.field is None  # it is another one now
         self.calls.append(("on_densify", context.iteration, context.view))
 
 
@@ -367,6 +373,9 @@ def test_hooks_are_called_for_every_view_and_once_a_step(scene: Scene, tmp_path:
     assert ends == [4, 8, 10, 14, 15, 16, 18, 20]
     assert [i for what, i, _ in counter.calls if what == "on_densify"] == [10]
     assert counter.shapes == {(3, 40, 56)}
+    assert {view.name for view in scene.train} == counter.cameras.keys()
+    for view in scene.train:
+        assert torch.equal(counter.cameras[view.name].world_to_camera, view.camera.world_to_camera)
     without = train(tmp_path / "without", scene, settings, rasterizer)
     for name, value in without.field(0).parameters.items():
         torch.testing.assert_close(with_hook.field(0).parameters[name], value, rtol=1e-3, atol=1e-4)

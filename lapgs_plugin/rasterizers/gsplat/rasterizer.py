@@ -86,6 +86,7 @@ class GsplatRasterizer(Rasterizer):
     """
 
     name = NAME
+    devices = ("cuda",)
     in_current_stream = True
 
     def __init__(

@@ -16,16 +16,25 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
+from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, mean_squared_distance
 from lapgs_plugin.reference_raster.standins import fused_ssim
 from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 
 __all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins"]
 
 
-def stand_ins(variant: str) -> dict[str, ModuleType]:
+def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType]:
     """Return the modules of a checkout of `variant` by their CUDA names: its rasterizer, simple_knn and fused_ssim.
+
+    Args:
+        variant: a key of `VARIANTS`.
+        neighbours: whether simple_knn is the one that returns neighbours beside their distances.
 
     Raises:
         UserInputError: there is no such variant.
@@ -33,6 +42,7 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
     if variant not in VARIANTS:
         raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
     ssim = {"fusedssim": fused_ssim.fusedssim, "fusedssim_backward": fused_ssim.fusedssim_backward}
+    knn = _distances_and_neighbours if neighbours else mean_squared_distance
     found = {}
     for each in (variant, *VARIANTS[variant].beside):
         name = VARIANTS[each].module
@@ -43,7 +53,7 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
     found |= {
         "simple_knn": _module("simple_knn", {}, package=True),
         # With fewer than four points the mean is over those that exist, where the CUDA code returns infinity.
-        "simple_knn._C": _module("simple_knn._C", {"distCUDA2": mean_squared_distance}),
+        "simple_knn._C": _module("simple_knn._C", {"distCUDA2": knn}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
     }
     for full, module in found.items():
@@ -53,6 +63,20 @@ def stand_ins(variant: str) -> dict[str, ModuleType]:
     return found
 
 
+def _distances_and_neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `mean_squared_distance` (n,), and three neighbours of each point (n, 3) int32, the nearest first.
+
+    With fewer than four points, those that do not exist are 0.
+    """
+    positions, count = points.detach().to("cpu", torch.float64).numpy(), min(NEIGHBOURS + 1, len(points))
+    found = cKDTree(positions).query(positions, k=range(1, count + 1))[1]  # (n, count)
+    others = found != np.arange(len(found))[:, None]
+    others[others.all(1), -1] = False  # points at the same position were found instead of the point itself
+    neighbours = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32)
+    neighbours[:, : count - 1] = torch.from_numpy(found[others].reshape(len(points), count - 1))
+    return mean_squared_distance(points), neighbours
+
+
 def _parents(name: str) -> list[str]:
     """Return the packages that a module is in, outermost first."""
     parts = name.split(".")
@@ -60,15 +84,15 @@ def _parents(name: str) -> list[str]:
 
 
 @contextmanager
-def install(variant: str) -> Iterator[dict[str, ModuleType]]:
+def install(variant: str, *, neighbours: bool = False) -> Iterator[dict[str, ModuleType]]:
     """Let imports of the CUDA modules find the stand-ins inside the block.
 
-    Modules that imported them keep them.
+    Modules that imported them keep them. Arguments are those of `stand_ins`.
 
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
     """
-    found = stand_ins(variant)
+    found = stand_ins(variant, neighbours=neighbours)
     taken = sorted(found.keys() & sys.modules.keys())
     if taken:
         raise UserInputError(f"{taken[0]} is already imported; install stand-ins before the checkout's modules")

@@ -9,13 +9,15 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, require_readable
 from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_photos, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import CONVERTED, camera_of, convert_photo, listed
+from lapgs_plugin.scenes.prepare.photos import camera_of, convert_photo, listed
 
 logger = logging.getLogger(__name__)
 
@@ -35,37 +37,39 @@ def make_photos(job: Job) -> None:
             write_frames(found.clip, numbers, partial, seen)
         logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
     else:
-        others = [name for name, source in found.files.items() if source.suffix.lower() in CONVERTED]
         for name, source in found.files.items():
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
             require_readable(source)
-            if name not in others:
+            if name not in found.converted:
                 shutil.copy2(source, partial / name)
-        job.each_photo("Converting photos", lambda name: convert_photo(found.files[name], partial / name), others)
+        job.each_photo(
+            "Converting photos", lambda name: convert_photo(found.files[name], partial / name), found.converted
+        )
     partial.rename(folder)
 
 
 def make_masks(job: Job) -> None:
-    """Write masks of the photos' sizes under COLMAP's names, white where nothing is known of a photo."""
+    """Write masks of the photos' sizes under COLMAP's names, if there are any.
+
+    Photos without one get a white one, because COLMAP leaves out photos without a mask.
+    """
     if job.masks.is_dir():
         return
     given = job.settings.masks
     files = {} if given is None else _given_masks(job, given)
-    names = job.names if files else [name for name in job.names if has_alpha(job.photos / name)]
-    if not names:
+    if not files and not any(has_alpha(job.photos / name) for name in job.names):
         return
     partial = job.work / "masks.partial"
     shutil.rmtree(partial, ignore_errors=True)
 
     def make(name: str) -> bool:
         photo = job.photos / name
-        size = image_size(photo)
-        mask = read_mask(files[name], size, size) if files else alpha_mask(photo, size)
-        if mask is not None:
-            write_mask(partial / f"{name}.png", mask)
+        width, height = image_size(photo)
+        mask = read_mask(files[name], (width, height), (width, height)) if files else alpha_mask(photo, (width, height))
+        write_mask(partial / f"{name}.png", torch.ones(1, height, width) if mask is None else mask)
         return mask is not None
 
-    if sum(job.each_photo("Reading masks", make, names)):
+    if any(job.each_photo("Reading masks", make, job.names)):
         partial.rename(job.masks)
 
 
@@ -86,9 +90,9 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
     refused: dict[str, SceneError] = {}
 
     def size(name: str) -> tuple[int, int]:
-        photo = job.found.files.get(name, job.photos / name)  # errors name the user's file, not our copy
-        if photo.suffix.lower() in CONVERTED:
-            photo = job.photos / name
+        photo = job.photos / name
+        if name not in job.found.converted:
+            photo = job.found.files.get(name, photo)  # errors name the user's file, not our copy
         try:
             width, height = check_image(photo)
             share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))

@@ -44,8 +44,8 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
             models = _placed_again(job, models, doubt)
     if _placed(models) < 2:
         raise SceneError(
-            f"{job.photos}: none of the {len(job.names)} photos could be placed; expected sharp photos of a static "
-            "scene that overlap strongly, each taken a step aside from the last"
+            f"{job.found.clip or job.found.folder}: none of the {len(job.names)} photos could be placed; expected "
+            "sharp photos of a static scene that overlap strongly, each taken a step aside from the last"
         )
     return models
 

@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import pycolmap
-import torch
 
 from lapgs_plugin.scenes.images import read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
@@ -30,8 +29,7 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
         write_image(job.scene / "images" / target, undistort(photo, lens))
         if not masked:
             return
-        file = job.masks / f"{image.name}.png"
-        mask = read_image(file, size=size) if file.is_file() else torch.ones(3, size[1], size[0])
+        mask = read_image(job.masks / f"{image.name}.png", size=size)
         write_mask(job.scene / MASKS / f"{target}.png", undistort(mask, lens)[:1] > 0.5)
 
     job.each_photo("Undistorting", write, images)
