@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from importlib import import_module
 from importlib.util import find_spec
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,6 +35,14 @@ def missing(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     for name in [key for key in sys.modules if key.partition(".")[0] in names]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(absent, "find_spec", lambda name: None if name in names else find_spec(name))
+
+
+def test_threads_that_are_started_inside_name_devices_too() -> None:
+    """As checkouts that load photos in a pool of threads."""
+    run = threading.Thread.run
+    with cuda_on_cpu("fastgs"), ThreadPool(2) as pool:
+        assert all(on_cpu(made) for made in pool.map(lambda _: torch.ones(2, device="cuda").cuda(), range(4)))
+    assert threading.Thread.run is run
 
 
 @pytest.mark.parametrize("device", CUDA, ids=repr)
