@@ -15,6 +15,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import shlex
 import shutil
 import tempfile
 import uuid
@@ -159,7 +160,7 @@ class HierarchyDriver:
                     # A run that is continued makes its images again.
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
-        logger.info("run folder: %s", folder)
+        logger.info("run folder: %s; next: `lapgs eval %s`", folder, shlex.quote(str(folder)))
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
