@@ -139,7 +139,7 @@ class TrainableField:
             else:
                 self._step_counting_views(optimizer, scale.views)
 
-    def _step_counting_views(self, optimizer: torch.optim.Optimizer, views: int) -> None:
+    def _step_counting_views(self, optimizer: Any, views: int) -> None:
         """Make a step for several views of PyTorch's or gsplat's Adam, whose betas and count are those of one view."""
         group, states = optimizer.param_groups[0], optimizer.state.values()
         betas = group["betas"]
