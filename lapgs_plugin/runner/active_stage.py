@@ -323,7 +323,7 @@ class ActiveStage:
             return
         rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)
         with self.record.after_archive("evaluation"), torch.no_grad():
-            self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)))
+            self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
             assert rendering.call is not None, "as it captures"
             problem = explain_other_values(self._adapter, rendering.call, field)
         if problem and builds_on:
