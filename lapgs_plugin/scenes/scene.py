@@ -37,6 +37,9 @@ from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1
+FAR = 1e3
+"""Distance of the cameras from the origin, in extents, from which on positions are rounded to a tenth of a pixel of 1K
+images. Models in coordinates of a map are further away."""
 
 logger = logging.getLogger(__name__)
 
@@ -294,5 +297,11 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
     if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
         raise SceneError(
             f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
+        )
+    if (away := float(centers.mean(dim=0).norm())) > FAR * extent:
+        logger.warning(
+            "%s: the cameras are %.3g from the origin, %.3g times the scene's extent, where float32 numbers are %.1g "
+            "apart: fine detail is lost; move the model to the origin, for example with COLMAP's model_transformer",
+            *(path, away, away / extent, np.spacing(np.float32(away))),
         )
     return extent

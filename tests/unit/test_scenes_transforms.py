@@ -380,6 +380,19 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
     assert scene.train[0].camera.position[0].item() == pytest.approx(1e6)
 
 
+@pytest.mark.parametrize(("away", "warned"), [(1e3, False), (5e5, True)])
+def test_coordinates_of_a_map_are_told(
+    tmp_path: Path, away: float, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = capture(tmp_path)
+    for i, eye in enumerate(eyes(10)):
+        there = np.array([away, 0.0, 0.0])
+        edit(path, {"transform_matrix": look_at(eye + there, tuple(there)).tolist()}, in_frame=i)
+    load(path)
+    assert ("the cameras are 5e+05 from the origin" in caplog.text) == warned
+    assert ("numbers are 0.03 apart" in caplog.text) == warned
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
