@@ -32,8 +32,8 @@ TEMPLATE = "experiment.html.jinja"
 COLORS = 8
 """Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
-    "weighted_gaussians": "Gaussians, mean of levels by iterations",
-    "mean_gaussians": "Gaussians at once, mean of iterations",
+    "weighted_gaussians": "Gaussians of levels, weighted by iterations",
+    "mean_gaussians": "Gaussians optimized, mean",
     "gaussians": "Gaussians to render",
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""

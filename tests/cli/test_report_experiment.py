@@ -98,7 +98,7 @@ def test_the_page_holds_every_scene_backbone_and_variant(experiment: Path) -> No
 def test_arrows_lead_from_bare_to_the_hierarchy_in_means_over_seeds(experiment: Path) -> None:
     lapgs_report(experiment)
     text = (experiment / "report.html").read_text()
-    assert "Optimization (s) against Gaussians over Gaussians, mean of levels by iterations" in text
+    assert "Optimization (s) against Gaussians over Gaussians of levels, weighted by iterations" in text
     drawn = re.findall(r'<g class="(.*?)"><title>(.*?)</title>\s*<circle cx="(.*?)" cy="(.*?)"', text)
     assert [each[:2] for each in drawn] == [
         ("line-variant-1 dot-variant-1", f"{s}, {b}: bare to two levels")

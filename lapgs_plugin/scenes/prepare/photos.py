@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from lapgs_plugin.errors import SceneError, counted, first_line, printable, require_extra
 from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG
-from lapgs_plugin.scenes.masks import HEIC, SUFFIXES
+from lapgs_plugin.scenes.masks import HEIC, has_photo_suffix
 
 SHOWN = 10
 """File names in a message, at most."""
@@ -55,7 +55,7 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         SceneError: there are fewer than two photos, or two would have the same name after undistortion.
         MissingExtraError: there are HEIC photos, and pillow-heif is not installed.
     """
-    if source.is_file() and source.suffix.lower() in (*SUFFIXES, *HEIC):
+    if source.is_file() and has_photo_suffix(source):
         raise SceneError(
             f"{source}: one photo, expected a folder of at least 2, better 30, or a video; give the folder"
         )
@@ -71,11 +71,11 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         and not any(part.startswith(".") for part in file.relative_to(source).parts)
         and not (aside is not None and file.resolve().is_relative_to(aside))
     )
-    chosen = [file for file in present if file.suffix.lower() in (*SUFFIXES, *HEIC)]
+    chosen = [file for file in present if has_photo_suffix(file)]
     if heic := [file.name for file in chosen if _kind(file) in HEIC]:
         what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed(heic)})"
         require_extra("pillow_heif", "heic", what, "convert them to JPEG")
-    others = sorted({file.suffix.lower() or file.name for file in present} - {*SUFFIXES, *HEIC})
+    others = sorted({file.suffix.lower() or file.name for file in present if not has_photo_suffix(file)})
     if len(chosen) < 2:
         found = f" (and files of type {', '.join(others)})" if others else ""
         raise SceneError(
@@ -154,3 +154,10 @@ def camera_of(photo: Path) -> tuple[str, ...]:
         values += [inner.get(tag) for tag in (tags.FocalLength, tags.FocalLengthIn35mmFilm)]
         return tuple("" if value is None else str(value).strip("\0 ") for value in values)
     return ("",) * 4
+
+
+def quarter_turns(photo: Path) -> int:
+    """Return the quarter turns clockwise that make a photo upright by EXIF; 0 where it does not tell, or mirrors."""
+    with suppress(Exception), Image.open(photo) as opened:  # as above
+        return {6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 1), 0)
+    return 0
