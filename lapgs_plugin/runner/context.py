@@ -33,15 +33,12 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass
-class Running:
-    """Hold the stage, or that of the dry run, which answers the replaced symbols; None between stages."""
-
-    stage: Any = None
-
-
-@dataclass(frozen=True)
 class RunContext:
-    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
+    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
+
+    Attributes:
+        stage: the running stage, or that of the dry run, which answers the replaced symbols; None between stages.
+    """
 
     adapter: BackboneAdapter
     options: RunSettings
@@ -52,7 +49,7 @@ class RunContext:
     parts: IterationParts
     watcher: Watcher
     measuring: MeasuringOptions
-    running: Running = field(default_factory=Running)
+    stage: Any = None
     _told: set[str] = field(default_factory=set)
 
     def warn_of_other_images(self, problem: str) -> None:

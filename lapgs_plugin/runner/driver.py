@@ -115,7 +115,7 @@ class HierarchyDriver:
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
-            counting_steps(self._adapter.profile, lambda: self._context.running.stage),
+            counting_steps(self._adapter.profile, lambda: self._context.stage),
         ):
             self._adapter.script.run_main()
 
@@ -170,7 +170,7 @@ class HierarchyDriver:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
             active = ActiveStage(self._context, run, window, call, tuple(finished), before)
-            self._context.running.stage = active
+            self._context.stage = active
             try:
                 active.load_images()
                 if stage.level in run.archive.available_levels:
@@ -181,7 +181,7 @@ class HierarchyDriver:
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
-                self._context.running.stage = None
+                self._context.stage = None
                 active.close()
             finished.append(FinishedStage(stage, call))
 

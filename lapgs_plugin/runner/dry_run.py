@@ -131,7 +131,7 @@ class DryRun:
                 raise _Enough  # the loop would run to its end
 
         self._context.wrapper.rendering = stage.rendering
-        self._context.running.stage = stage
+        self._context.stage = stage
         watching = register_optimizer_step_post_hook(stepped)
         try:
             with self._step("the first iteration", "one as without lapgs", works):
@@ -141,7 +141,7 @@ class DryRun:
         finally:
             watching.remove()
             self._context.wrapper.rendering = None
-            self._context.running.stage = None
+            self._context.stage = None
         if stage.iteration == 0:
             raise UserInputError(
                 f"{self._training_place}: {stage.call.function.__name__}() began no iteration, expected one call of "

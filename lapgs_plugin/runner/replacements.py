@@ -59,7 +59,7 @@ class StageReplacements:
         ]
 
     def _running(self) -> ActiveStage | None:
-        stage: ActiveStage | None = self._context.running.stage
+        stage: ActiveStage | None = self._context.stage
         return stage
 
     def _in_residual(self) -> bool:

@@ -102,7 +102,7 @@ class SingleCall:
             self._explain_failure(self._stage)
             raise
         finally:
-            self._context.running.stage = None
+            self._context.stage = None
             self._stage.close()
 
     def _explain_failure(self, stage: NestedStage) -> None:
@@ -127,7 +127,7 @@ class SingleCall:
         given = self._run.call.opt
         for name in self._context.adapter.densify_thresholds(given):
             setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
-        self._context.running.stage = stage
+        self._context.stage = stage
         stage.load_images()
         stage.begin()
 
