@@ -136,10 +136,10 @@ class TrainingCall:
                 lists[name] = Namespace(**{**vars(value), **{n: change(i) for n, i in _iteration_lists(vars(value))}})
         return replace(self, values={**self.values, **lists})
 
-    def run(self) -> None:
-        """Make the call."""
+    def run(self) -> Any:
+        """Make the call and return its result."""
         with self.own_folder():
-            self.function(**self.values)
+            return self.function(**self.values)
 
     @contextmanager
     def own_folder(self) -> Iterator[None]:
