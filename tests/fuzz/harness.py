@@ -283,7 +283,7 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
     Args:
         folder: nothing outside of it changes.
         steps: an action, the path it is about, and for "move" another name, for "copy" another path. Those whose
-            paths a former step removed are left out.
+            paths a former step removed or whose other name a folder has are left out.
     """
     for action, name, *other in steps:
         path = folder / name
@@ -296,7 +296,8 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
             target.write_bytes(path.read_bytes())
             continue
         if action == "move":
-            path.rename(path.with_name(target.name))
+            if not path.with_name(target.name).is_dir():
+                path.rename(path.with_name(target.name))
             continue
         if path.is_dir():
             shutil.rmtree(path)
