@@ -24,6 +24,8 @@ from random import Random
 from types import TracebackType
 from typing import Any
 
+from tests.fuzz.worker import STOPPED
+
 MOST_BYTES = 1_500_000_000
 """Of the whole process, torch and all."""
 MOST_SECONDS = 60.0
@@ -32,9 +34,6 @@ MOST_MORE = 4_000_000_000
 START_SECONDS = 300.0
 LONGEST_LINE = 1_500
 """Characters of a message: one that quotes a whole file is no line."""
-STOPPED = 130
-"""Exit code of a training that `worker` ended: everything that was read was good."""
-
 ROOT = Path(__file__).parents[2]
 Damage = Callable[[bytes, Random], bytes]
 

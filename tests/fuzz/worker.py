@@ -19,6 +19,8 @@ from typing import Any
 
 STAGE_ITERATIONS = 2
 """Of the finest level, then training is stopped: long enough to use everything that was read."""
+STOPPED = 130
+"""Exit code of a training that this module ended, or that diverged."""
 COARSE_ITERATIONS = 20
 """Of a coarser level, which whole files do not reach: a damaged manifest may ask for a thousand million."""
 
@@ -81,7 +83,7 @@ def limit_memory(more: int) -> None:
 
 def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -> dict[str, Any]:
     """How a command ended: its exit code, its message or the traceback that escaped, its seconds and bytes."""
-    from lapgs_plugin.errors import LapgsError
+    from lapgs_plugin.errors import LapgsError, TrainingDivergedError
 
     out, errors = io.StringIO(), io.StringIO()
     code, message, trace, starved = 0, "", "", False
@@ -89,6 +91,8 @@ def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
         try:
             commands(command)
+        except TrainingDivergedError:
+            code = STOPPED  # everything was read, and a damaged rate is a large one
         except LapgsError as error:
             code, message, starved = error.exit_code, str(error), _starved(error)
         except SystemExit as error:
