@@ -24,7 +24,7 @@ from importlib.metadata import EntryPoint, entry_points
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, typed_line
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, render_values
@@ -122,7 +122,7 @@ class StageHook:
 
         Args:
             context: the iteration.
-            image: (3, h, w) composed prediction.
+            image: (3, h, w) composed prediction, at the exposure of the photo where that is compensated.
 
         Returns:
             A scalar, or None to add nothing.
@@ -286,7 +286,7 @@ def entry_point_hooks() -> tuple[StageHook, ...]:
             hook = entry.load()()
         except Exception as error:  # any error of a plugin's code must name the plugin
             raise UserInputError(
-                f"hook {source} cannot be created: {type(error).__name__}: {error}; "
+                f"hook {source} cannot be created: {typed_line(error)}; "
                 "expected a StageHook class without arguments, fix or uninstall the package that brings it"
             ) from error
         verify_hook(hook, source)

@@ -44,7 +44,7 @@ class LoggingProgress(Progress):
     def add_task(self, *arguments: Any, **options: Any) -> TaskID:
         """Add a task as rich does."""
         task = super().add_task(*arguments, **options)
-        self._printed[task] = time.monotonic(), self._task(task).completed
+        self._printed[task] = time.monotonic(), self._tasks[task].completed
         return task
 
     def update(self, task_id: TaskID, **options: Any) -> None:
@@ -57,13 +57,10 @@ class LoggingProgress(Progress):
         super().advance(task_id, advance)
         self._print_if_due(task_id)
 
-    def _task(self, task_id: TaskID) -> Task:
-        return self._tasks[task_id]
-
     def _print_if_due(self, task_id: TaskID) -> None:
         if not self.disable:
             return
-        task, now = self._task(task_id), time.monotonic()
+        task, now = self._tasks[task_id], time.monotonic()
         since, done = self._printed[task_id]
         if task.finished:
             due = done < task.completed

@@ -17,7 +17,7 @@ from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
@@ -265,7 +265,7 @@ class Finishing:
 def direct_on_cpu(finishing: Any = Finishing) -> Iterator[None]:
     """Let `gsplat.direct` find these kernels, and `finishing` in place of `gsplat.kernels`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(direct, "compiled_functions", Compiled)
+        patch.setattr(bindings, "compiled_functions", Compiled)
         patch.setattr(torch.cuda, "device", lambda device: nullcontext())
         patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", finishing)
         yield

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import random
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, wraps
@@ -23,10 +24,15 @@ KEY = "lapgs_key"
 """Attribute of cameras, and of all copies of them, with the key of the image."""
 
 SCALED = {
-    **dict.fromkeys(("image_width", "width", "img_width", "w", "focal", "focal_length", "focal_x", "fx", "cx"), 0),
-    **dict.fromkeys(("image_height", "height", "img_height", "h", "focal_y", "fy", "cy"), 1),
+    **dict.fromkeys(
+        ("image_width", "width", "img_width", "w", "focal", "focal_length", "focal_x", "fl_x", "fx", "cx"), 0
+    ),
+    **dict.fromkeys(("image_height", "height", "img_height", "h", "focal_y", "fl_y", "fy", "cy"), 1),
 }
-"""Numbers of cameras in pixels by lower-case name, each with its axis: 0 is horizontal."""
+"""Numbers of cameras in pixels by lower-case name, each with its axis: 0 is horizontal.
+
+Up to 1 they are no pixels: shares of the image, or the -1 of what is unknown.
+"""
 
 INTRINSICS = {"K", "intrinsic", "intrinsics", "camera_matrix"}
 """Matrices of cameras in pixels."""
@@ -75,7 +81,8 @@ class SceneImages:
 
     def __init__(self) -> None:
         self._images: dict[str, FullSizeImage] = {}
-        self._making = False
+        # Some checkouts make their cameras in several threads.
+        self._making, self._lock = threading.local(), threading.Lock()
         self.masks: dict[str, Tensor] = {}
 
     def adopting(self, original: Callable[..., None]) -> Callable[..., None]:
@@ -87,12 +94,12 @@ class SceneImages:
             bound = signature.bind(camera, *args, **kwargs)
             if "data_device" in signature.parameters:
                 bound.arguments["data_device"] = "cpu"  # avoids a copy of the image to the GPU and back
-            outermost = not self._making
-            self._making = True
+            outermost = not getattr(self._making, "now", False)
+            self._making.now = True
             try:
                 original(*bound.args, **bound.kwargs)
             finally:
-                self._making = not outermost
+                self._making.now = not outermost
             if outermost:  # a derived class calls this one before it is ready
                 self._adopt(camera)
 
@@ -106,8 +113,10 @@ class SceneImages:
                 f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
                 "scene's images as RGB"
             )
-        key = f"{len(self._images):05d}-{camera.image_name}"
-        self._images[key] = FullSizeImage.of(image)
+        stored = FullSizeImage.of(image)
+        with self._lock:
+            key = f"{len(self._images):05d}-{camera.image_name}"
+            self._images[key] = stored
         del camera.original_image
         setattr(camera, KEY, key)
 
@@ -202,7 +211,7 @@ def without_depth(view: Any) -> None:
 def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int]) -> Any:
     """Return an attribute of a camera at another size, the same object if it does not depend on the size."""
     if isinstance(value, np.ndarray) and value.shape[-2:] == full[::-1]:
-        return _shrunk(torch.from_numpy(value), size).numpy()
+        return shrunk(torch.from_numpy(value), size).numpy()
     if isinstance(value, (Tensor, np.ndarray)) and name in INTRINSICS and value.shape[-2:] in ((3, 3), (4, 4)):
         scaled: Any = copy.deepcopy(value)
         for row in range(2):
@@ -210,20 +219,26 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
         return scaled
     if isinstance(value, Tensor) and value.shape[-2:] == full[::-1] and value.ndim > 1:
         opaque = name == "alpha_mask" and bool((value == 1).all())
-        return None if opaque else _shrunk(value, size)  # without a mask loops save a pass over the image
+        return None if opaque else shrunk(value, size)  # without a mask loops save a pass over the image
     if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
         return type(value)(size if tuple(value) == full else size[::-1])
-    if isinstance(value, (int, float, np.number)) and name.lower() in SCALED:
+    if isinstance(value, (int, float, np.number)) and name.lower() in SCALED and value > 1:
         axis, kind = SCALED[name.lower()], cast("Any", type(value))
         return kind(float(value) * size[axis] / full[axis]) if value != full[axis] else size[axis]
     return value
 
 
-def _shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return an image (..., h, w) averaged down to `size` (width, height); float32, or bool from bool."""
+def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return an image (..., h, w) at a smaller `size` (width, height).
+
+    Floats are averaged, to float32; a mask has what most of the pixels are. Whole numbers are labels, which have no
+    averages: they are sampled.
+    """
     flat = image.reshape(-1, 1, *image.shape[-2:]).float()
-    result = torch.nn.functional.interpolate(flat, size[::-1], mode="area").reshape(*image.shape[:-2], *size[::-1])
-    return result >= 0.5 if image.dtype == torch.bool else result
+    labels = not (image.is_floating_point() or image.dtype == torch.bool)
+    result = torch.nn.functional.interpolate(flat, size[::-1], mode="nearest-exact" if labels else "area")
+    result = result.reshape(*image.shape[:-2], *size[::-1])
+    return result >= 0.5 if image.dtype == torch.bool else result.to(image.dtype) if labels else result
 
 
 class PrefetchingViews(list[Any]):

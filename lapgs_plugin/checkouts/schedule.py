@@ -95,8 +95,10 @@ class Operand:
     def value(self, variables: Mapping[str, Any]) -> Any:
         """Return its value, None if that is known inside of the loop only."""
         if self.option is not None:
-            found = variables.get(self.option[0])
-            return getattr(found, self.option[1], None) if self.option[1] else found
+            found, name = variables.get(self.option[0]), self.option[1]
+            if isinstance(found, Mapping) and name:
+                return found.get(name)
+            return getattr(found, name, None) if name else found
         try:
             return ast.literal_eval(self.node)
         except ValueError:
@@ -314,7 +316,10 @@ class StageSchedule:
                 continue
             if result[variable] is values[variable]:
                 result[variable] = copy.copy(values[variable])
-            setattr(result[variable], attribute, value)
+            if isinstance(result[variable], dict):
+                result[variable][attribute] = value
+            else:
+                setattr(result[variable], attribute, value)
         return result
 
     def function(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -368,11 +373,12 @@ class _Rewriter(ast.NodeTransformer):
 
 
 def _option(node: ast.expr) -> tuple[str, str] | None:
-    """Return (variable, attribute) of an option such as `opt.iterations`; the attribute of a variable is empty."""
+    """Return (variable, name) of `opt.iterations` or `opt["iterations"]`; the name of a variable itself is empty."""
     if isinstance(node, ast.Name):
         return node.id, ""
-    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-        return node.value.id, node.attr
+    if isinstance(node, (ast.Attribute, ast.Subscript)) and isinstance(node.value, ast.Name):
+        name = node.attr if isinstance(node, ast.Attribute) else getattr(node.slice, "value", None)
+        return (node.value.id, name) if isinstance(name, str) else None
     return None
 
 

@@ -80,9 +80,9 @@ def export(
 
         lapgs export runs/garden --level 1 --out /tmp/base
 
-        lapgs export runs/garden --merge       (residuals as one ordinary field)
+        lapgs export runs/garden --merge    # residuals as one ordinary field
 
-        lapgs export runs/garden --merge --html       (a page for the web)
+        lapgs export runs/garden --merge --html    # a page for the web
     """
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.layout import EXPORT

@@ -10,7 +10,8 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import show_log
-from lapgs_plugin.cli.viewing import HOST, PORT, open_page, require_viser
+from lapgs_plugin.cli.viewing import HOST, PORT, open_page
+from lapgs_plugin.errors import require_extra
 from lapgs_plugin.files import require_manifest
 from lapgs_plugin.rendering.options import RenderOptions
 
@@ -49,7 +50,7 @@ def view(
 
         ssh -L 8080:localhost:8080 gpu-machine lapgs view runs/garden
     """
-    require_viser("lapgs view")
+    require_extra("viser", "viewer", "lapgs view")
     for folder in filter(None, (run, baseline)):
         require_manifest(folder.absolute())
     from lapgs_plugin.viewer.preview import read_preview

@@ -38,11 +38,6 @@ class ViewOptions:
             raise UserInputError(f"--view-port {self.view_port} needs --view; leave it out")
 
 
-def require_viser(what: str) -> None:
-    """Check that viser is installed, which `what` needs; see `require_extra`."""
-    require_extra("viser", "viewer", what)
-
-
 def open_page(host: str, port: int, label: str, until: str, preview: Image | None = None) -> Page:
     """Serve the viewer's page and print its address.
 
@@ -75,7 +70,7 @@ def watching(options: ViewOptions, label: str, device: str = "auto") -> Iterator
     if not options.view:
         yield Watcher()
         return
-    require_viser("--view")
+    require_extra("viser", "viewer", "--view")
     with open_page(HOST, options.view_port or PORT, label, "it shows the run while it is trained") as page:
         from lapgs_plugin.viewer.live import LiveView
 

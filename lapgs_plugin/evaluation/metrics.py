@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 
 import torch
@@ -101,6 +101,9 @@ def mean_quality(pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, T
     Args:
         pairs: image, target and perhaps a mask, as `psnr` and `ssim` take them.
     """
-    measured = [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs]
-    names = measured[0] if measured else {}
-    return {name: fmean(each[name] for each in measured) for name in names}
+    return means([{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs])
+
+
+def means(entries: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of each figure over entries that all have it; empty without an entry."""
+    return {name: fmean(each[name] for each in entries) for name in (entries[0] if entries else ())}

@@ -145,21 +145,16 @@ def path_frames(
     solid = min(level for level, field in surface.fields.items() if not field.signed)
     for camera in cameras:
         composition = renderer.render(camera)
-        coarsest = renderer.levels - 1
-        images = {
-            COMPOSITION: to_full_size(
-                composition.composed[renderer.finest], camera.size, renderer.finest, renderer.pyramid
-            )
-        }
+        finest = composition.composed[renderer.finest]
+        composed = to_full_size(finest, camera.size, renderer.finest, renderer.pyramid).clamp(0.0, 1.0)
+        images = {COMPOSITION: composed}
         if renderer.levels > 1:
-            bands = {coarsest: composition.base, **composition.residuals}
-            for level, band in bands.items():
+            for level, band in {renderer.levels - 1: composition.base, **composition.residuals}.items():
                 images[f"band {level}"] = to_full_size(band, camera.size, level, renderer.pyramid)
-        images[COMPOSITION] = images[COMPOSITION].clamp(0.0, 1.0)
         if single is not None:
-            images[SINGLE] = single.render(camera).composed[0].to(images[COMPOSITION]).clamp(0.0, 1.0)
+            images[SINGLE] = single.render(camera).composed[0].to(composed).clamp(0.0, 1.0)
         depth = render_depth(surface.rasterizer, surface.field(solid), camera)
-        yield Frame(camera, depth.to(images[COMPOSITION].device), images)
+        yield Frame(camera, depth.to(composed.device), images)
 
 
 def evaluate_stability(

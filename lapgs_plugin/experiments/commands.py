@@ -208,7 +208,7 @@ def _import(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[s
 def _raster_options(arguments: Sequence[str]) -> list[str]:
     """Return the script's arguments that affect how a saved field is rendered, the last of each kind."""
     values: dict[str, str] = {}
-    for word, following in zip(arguments, [*arguments[1:], "-"], strict=True):
+    for word, following in zip(arguments, [*arguments, "-"][1:], strict=True):
         name, assigned, value = word.removeprefix("--").partition("=")
         if word.startswith("--") and name in RASTER_OPTIONS:
             values[name] = value if assigned else "true" if following.startswith("-") else following

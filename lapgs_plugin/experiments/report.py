@@ -32,8 +32,8 @@ TEMPLATE = "experiment.html.jinja"
 COLORS = 8
 """Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
-    "weighted_gaussians": "Gaussians, mean of levels by iterations",
-    "mean_gaussians": "Gaussians at once, mean of iterations",
+    "weighted_gaussians": "Gaussians of levels, weighted by iterations",
+    "mean_gaussians": "Gaussians optimized, mean",
     "gaussians": "Gaussians to render",
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
@@ -246,11 +246,11 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:
-    """Open a run's folder inside the experiment's folder.
+    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved.
 
     Raises:
         RunFolderError: it is missing or damaged.
     """
-    path = folder / RUNS / str(row["run"])
+    path = folder / RUNS / Path(str(row.get("folder", row["run"]))).name
     archive = RunArchive.open(path / IMPORTED if is_folder(path / IMPORTED) else path)
     return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})

@@ -165,8 +165,9 @@ def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange,
     ]
     after = {}
     for file in recipe.files:
-        edits = [edit for edit in recipe.edits if edit.anchor.file == file and edit.set in wanted]
-        checks = [check for check in recipe.checks if check.anchor.file == file and check.set in wanted]
+        edits = [edit for edit in recipe.edit if edit.file == file and edit.set in wanted]
+        of_sets = [(anchor, check) for check in recipe.check if check.set in wanted for anchor in check.anchors]
+        checks = [(anchor, check) for anchor, check in of_sets if anchor.file == file]
         if file not in sources:
             problems += [f"{file}: expected this file"] if edits or checks else []
             continue
@@ -205,12 +206,12 @@ def _damage(file: str, source: str, sets: Collection[str]) -> list[str]:
     return problems
 
 
-def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tuple[str, list[str]]:
+def _edited(source: str, edits: Sequence[Edit], checks: Sequence[tuple[Anchor, Check]]) -> tuple[str, list[str]]:
     """Return the source with the edits applied, and the problems; with problems the text is not complete."""
     tokens = tokenize(source)
     problems = []
-    for check in checks:
-        _, problem = _locate(source, tokens, check.anchor, check.times)
+    for anchor, check in checks:
+        _, problem = _locate(source, tokens, anchor, check.times)
         if problem is not None:
             problems.append(f"{problem}: {check.because}")
     pieces: list[tuple[int, int, str]] = []  # start, end, text in place of source[start:end]
@@ -222,7 +223,7 @@ def _edited(source: str, edits: Sequence[Edit], checks: Sequence[Check]) -> tupl
             problems.append(f"{problem} (edit {edit.label})")
             continue
         start, end = tokens[place.start].start, tokens[place.stop - 1].end
-        if edit.replaces:
+        if edit.replace is not None:
             pieces.append((start, end, replacement(source, start, end, edit.label, edit.put)))
         else:
             at, text = insertion(source, start, edit.label, edit.put)

@@ -2,55 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-from typing_extensions import NotRequired
+from typing import Any, ClassVar
 
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.patching.tokens import occurrences, tokenize
-from lapgs_plugin.untrusted import Strict, read_toml, shortened
-
-
-class _Place(Strict):
-    file: str
-    find: NotRequired[str]
-    function: NotRequired[str]
-
-
-class _EditEntry(Strict):
-    set: str
-    name: str
-    file: str
-    find: str
-    function: NotRequired[str]
-    before: NotRequired[str]
-    replace: NotRequired[str]
-    unless: NotRequired[Any]  # `_edit` checks it
-
-
-class _CheckEntry(Strict):
-    set: str
-    find: str
-    times: int
-    because: str
-    places: list[_Place]
-
-
-class _File(Strict):
-    """Type the contents of a recipe's file; patches/README.md explains the entries."""
-
-    name: str
-    title: str
-    present: list[_Place]
-    absent: NotRequired[list[_Place]]
-    extends: NotRequired[str]
-    reinstall: NotRequired[str]
-    opt_in: NotRequired[list[str]]
-    edit: NotRequired[list[_EditEntry]]
-    check: NotRequired[list[_CheckEntry]]
+from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
 
 @dataclass(frozen=True)
@@ -63,30 +21,58 @@ class Anchor:
         function: function whose definition is searched; None for the whole file.
     """
 
+    __pydantic_config__: ClassVar[Any] = STRICT
+
     file: str
-    find: str
+    find: str = ""
     function: str | None = None
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Describe one small change at a place that must be unique.
+    """Describe one small change at a place that must be unique, `[[edit]]` in a file.
 
     Attributes:
         set: the set of edits that it belongs to, such as "signed-color".
         name: unique name in its set.
-        anchor: the place.
-        put: text to insert before the anchor's tokens, or to replace them with.
-        replaces: whether the tokens are replaced.
+        file, find, function: the place, see `Anchor`.
+        before: text to insert before the place's tokens.
+        replace: text to replace them with, instead of `before`.
         unless: directives; the edit is not needed if the file has one of them outside of any condition.
+
+    Raises:
+        ValueError: a value is not usable.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     set: str
     name: str
-    anchor: Anchor
-    put: str
-    replaces: bool
+    file: str
+    find: str
+    function: str | None = None
+    before: str | None = None
+    replace: str | None = None
     unless: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require_tokens(self.find)
+        if (self.before is None) == (self.replace is None):
+            raise ValueError(f"{self.name!r} has both or none, expected either `before` or `replace`")
+        if not self.put.isascii():
+            raise ValueError(f"{self.name!r} puts in {shortened(self.put)}, expected ASCII, the same in every encoding")
+        if not all(text.startswith("#") for text in self.unless):
+            raise ValueError(f"{self.name!r} has unless = {self.unless!r}, expected directives that start with #")
+
+    @property
+    def anchor(self) -> Anchor:
+        """The place."""
+        return Anchor(self.file, self.find, self.function)
+
+    @property
+    def put(self) -> str:
+        """Text to put in."""
+        return (self.before or self.replace or "").strip("\n")
 
     @property
     def label(self) -> str:
@@ -96,44 +82,67 @@ class Edit:
 
 @dataclass(frozen=True)
 class Check:
-    """Require that tokens occur exactly `times` times, without which the set's edits would be wrong.
+    """Require that tokens occur exactly `times` times at each place, without which the set's edits would be wrong.
 
     Attributes:
         because: reason, which ends the message when the check fails.
+
+    Raises:
+        ValueError: there are no tokens.
     """
 
+    __pydantic_config__: ClassVar[Any] = STRICT
+
     set: str
-    anchor: Anchor
+    find: str
     times: int
     because: str
+    places: tuple[Anchor, ...]
+
+    def __post_init__(self) -> None:
+        _require_tokens(self.find)
+
+    @property
+    def anchors(self) -> list[Anchor]:
+        """The places, with the tokens."""
+        return [replace(place, find=self.find) for place in self.places]
+
+
+def _require_tokens(find: str) -> None:
+    if not tokenize(find):
+        raise ValueError(f"find = {find!r} has nothing to find")
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Describe one extension and the edits for it.
+    """Describe one extension and the edits for it: the content of a file; patches/README.md explains the entries.
 
     Attributes:
         name: stem of its file in `patches/`.
         title: name in messages.
         present, absent: places that its folder must and must not have to be recognised.
+        extends: name of the recipe that it inherits from.
         reinstall: command that builds and installs it again; `{folder}` stands for its folder.
-        edits, checks: edits and checks in the order of the file, inherited ones first.
         opt_in: sets that change ordinary calls; applying "all" leaves them out.
+        edit, check: edits and checks in the order of the file, inherited ones first.
     """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
 
     name: str
     title: str
     present: tuple[Anchor, ...]
-    absent: tuple[Anchor, ...]
-    reinstall: str
-    edits: tuple[Edit, ...]
-    checks: tuple[Check, ...]
+    absent: tuple[Anchor, ...] = ()
+    extends: str | None = None
+    reinstall: str = ""
     opt_in: tuple[str, ...] = ()
+    edit: tuple[Edit, ...] = ()
+    check: tuple[Check, ...] = ()
 
     @property
     def sets(self) -> tuple[str, ...]:
         """Sets of edits for this extension."""
-        return tuple(dict.fromkeys(edit.set for edit in self.edits))
+        return tuple(dict.fromkeys(edit.set for edit in self.edit))
 
     @property
     def default_sets(self) -> tuple[str, ...]:
@@ -143,8 +152,8 @@ class Recipe:
     @property
     def files(self) -> tuple[str, ...]:
         """Files of its edits and checks."""
-        anchors = [edit.anchor for edit in self.edits] + [check.anchor for check in self.checks]
-        return tuple(dict.fromkeys(anchor.file for anchor in anchors))
+        checked = [place.file for check in self.check for place in check.places]
+        return tuple(dict.fromkeys([*(edit.file for edit in self.edit), *checked]))
 
     def recognises(self, folder: Path) -> bool:
         """Return whether `folder` has the sources of this extension."""
@@ -169,8 +178,8 @@ def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
         PatchError: a file is not a recipe.
     """
     paths = sorted((folder or patches_folder()).glob("*.toml"))
-    tables = {path.stem: _read(path) for path in paths}
-    return tuple(_recipe(name, tables) for name in tables)
+    own = {path.stem: _read(path) for path in paths}
+    return tuple(_with_inherited(name, own) for name in own)
 
 
 def read_source(path: Path) -> str:
@@ -193,72 +202,30 @@ def _stands(anchor: Anchor, folder: Path) -> bool:
     return not anchor.find or bool(occurrences(tokens, anchor.find, range(len(tokens))))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    table: dict[str, Any] = read_toml(path, _File, error=PatchError, advice="patches/README.md says what it holds")
-    if table["name"] != path.stem:
-        raise PatchError(f"{path}: its name is {shortened(table['name'])}, expected that of the file; correct it")
-    return table
+def _read(path: Path) -> Recipe:
+    recipe: Recipe = read_toml(path, Recipe, error=PatchError, advice="patches/README.md says what it holds")
+    if recipe.name != path.stem:
+        raise PatchError(f"{path}: its name is {shortened(recipe.name)}, expected that of the file; correct it")
+    return recipe
 
 
-def _recipe(name: str, tables: dict[str, dict[str, Any]], heirs: tuple[str, ...] = ()) -> Recipe:
+def _with_inherited(name: str, recipes: dict[str, Recipe], heirs: tuple[str, ...] = ()) -> Recipe:
     """Return a recipe with its inherited edits and checks; `heirs` are the recipes that inherit from it."""
-    table = tables[name]
-    parent = table.get("extends")
-    if parent in (name, *heirs):
+    own = recipes[name]
+    if own.extends is None:
+        return own
+    if own.extends in (name, *heirs):
         raise PatchError(
-            f"patches/{name}.toml: extends {shortened(parent)}, which extends it; expected one without a circle"
+            f"patches/{name}.toml: extends {shortened(own.extends)}, which extends it; expected one without a circle"
         )
-    if parent is not None and parent not in tables:
-        raise PatchError(f"patches/{name}.toml: extends {shortened(parent)}, expected one of {sorted(tables)}")
-    base = _recipe(parent, tables, (name, *heirs)) if parent is not None else Recipe(name, "", (), (), "", (), ())
-    try:
-        return replace(
-            base,
-            name=name,
-            title=table["title"],
-            present=tuple(_place(item) for item in table["present"]),
-            absent=tuple(_place(item) for item in table.get("absent", ())),
-            reinstall=table.get("reinstall", base.reinstall),
-            edits=_inherited(base.edits, [_edit(item) for item in table.get("edit", ())]),
-            checks=base.checks + tuple(check for item in table.get("check", ()) for check in _checks(item)),
-            opt_in=base.opt_in + tuple(table.get("opt_in", ())),
-        )
-    except ValueError as error:
-        raise PatchError(f"patches/{name}.toml: {error}; patches/README.md says what an entry holds") from error
-
-
-def _inherited(base: Sequence[Edit], own: Sequence[Edit]) -> tuple[Edit, ...]:
-    """Return the edits of both; its own edit replaces an inherited one with the same label."""
-    return tuple({edit.label: edit for edit in (*base, *own)}.values())
-
-
-def _place(item: dict[str, str]) -> Anchor:
-    return Anchor(item["file"], item.get("find", ""))
-
-
-def _edit(item: dict[str, Any]) -> Edit:
-    anchor = _anchor(item["file"], item["find"], item.get("function"))
-    kinds = item.keys() - {"set", "name", "file", "find", "function", "unless"}
-    if kinds not in ({"before"}, {"replace"}):
-        raise ValueError(f"edit {item['name']!r}: expected either `before` or `replace`, got {sorted(kinds)}")
-    (kind,) = kinds
-    put = item[kind].strip("\n")
-    if not put.isascii():
-        raise ValueError(f"edit {item['name']!r}: expected ASCII, the same in every encoding a source may have")
-    unless = item.get("unless", [])
-    if not (isinstance(unless, list) and all(isinstance(text, str) and text.startswith("#") for text in unless)):
-        raise ValueError(f"edit {item['name']!r}: unless = {unless!r}, expected a list of directives that start with #")
-    return Edit(item["set"], item["name"], anchor, put, kind == "replace", tuple(unless))
-
-
-def _anchor(file: str, find: str, function: str | None) -> Anchor:
-    if not tokenize(find):
-        raise ValueError(f"{file}: find = {find!r} has nothing to find")
-    return Anchor(file, find, function)
-
-
-def _checks(item: dict[str, Any]) -> list[Check]:
-    return [
-        Check(item["set"], _anchor(place["file"], item["find"], place.get("function")), item["times"], item["because"])
-        for place in item["places"]
-    ]
+    if own.extends not in recipes:
+        raise PatchError(f"patches/{name}.toml: extends {shortened(own.extends)}, expected one of {sorted(recipes)}")
+    base = _with_inherited(own.extends, recipes, (name, *heirs))
+    edits = {edit.label: edit for edit in (*base.edit, *own.edit)}  # its own replaces one with the same label
+    return replace(
+        own,
+        reinstall=own.reinstall or base.reinstall,
+        opt_in=base.opt_in + own.opt_in,
+        edit=tuple(edits.values()),
+        check=base.check + own.check,
+    )

@@ -12,7 +12,7 @@ from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
 
 Metrics = dict[str, Any]
-"""Content of metrics.json, see `figures.run_figures`."""
+"""Content of metrics.json, see `evaluation.figures`."""
 
 OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"}
 """Rows that are left out when no run has them: imported runs know little of their training, a CPU no GPU memory."""
@@ -64,9 +64,9 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),
         ("overhead_seconds", "Overhead (s)", "{:.1f}", _difference("{:+.1f} s")),
         ("num_gaussians", "Gaussians to render", "{:,.0f}", _ratio),
-        ("weighted_gaussians", "Gaussians, mean of levels by iterations", "{:,.0f}", _ratio),
-        ("mean_gaussians", "Gaussians at once, mean of iterations", "{:,.0f}", _ratio),
-        ("peak_gaussians", "Most Gaussians at once", "{:,.0f}", _ratio),
+        ("weighted_gaussians", "Gaussians of levels, weighted by iterations", "{:,.0f}", _ratio),
+        ("mean_gaussians", "Gaussians optimized, mean", "{:,.0f}", _ratio),
+        ("peak_gaussians", "Gaussians optimized, most", "{:,.0f}", _ratio),
         ("peak_memory_bytes", "Peak GPU memory (GB)", "{:.2f}", _ratio),
         ("peak_memory_without_images_bytes", "Peak GPU memory without images (GB)", "{:.2f}", _ratio),
         ("fps", "Frames a second", "{:,.0f}", _ratio),

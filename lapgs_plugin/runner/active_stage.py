@@ -11,15 +11,26 @@ from typing import Any
 import torch
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
-from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError, first_line, typed_line
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    FieldError,
+    LapgsError,
+    TrainingDivergedError,
+    UserInputError,
+    first_line,
+    typed_line,
+)
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pruning import unpruned_line
+from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_record import StageRecord
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -149,6 +160,7 @@ class ActiveStage:
         """
         self.begin()
         self._call.run()
+        self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 
     def begin(self) -> None:
@@ -157,6 +169,26 @@ class ActiveStage:
         self.record.start()
         self._context.hooks.stage_begins(self.stage, self._views.rendering)
         self._context.watcher.stage_started(self.stage)
+
+    def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
+        """Check that the script's call, which has returned, trained this stage, the last one that it trains.
+
+        Args:
+            done, total: iterations of the call that were seen, and those that it was asked for.
+            ended: whether it got as far as to the last stage.
+
+        Raises:
+            LapgsError: no iteration of the stage was seen, or the call returned before the last stage.
+        """
+        name = self._call.function.__name__
+        if not ended or self.iteration == 0:
+            raise LapgsError(
+                f"{name}() ended after {done} of {total} iterations, in level {self.stage.level}; expected one call of "
+                f"{CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run --off`, or "
+                "with as many --iterations as it runs"
+            )
+        if done != total:
+            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, done, total)
 
     def finish(self) -> StageResult:
         """Archive the field after the stage's last iteration.
@@ -173,6 +205,7 @@ class ActiveStage:
         self.record.archive(result, None if self._joint is None else self._joint.fields(self._exported))
         if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
+        self._compare(gaussians, field)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
@@ -278,6 +311,24 @@ class ActiveStage:
                 "eval` measures the run",
                 *(self.stage.level, typed_line(error)),
             )
+
+    def _compare(self, gaussians: Any, field: GaussianField) -> None:
+        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run.
+
+        Raises:
+            UserInputError: they differ, and a residual would be added to another image than the checkout's.
+        """
+        builds_on = self.stage.level > 0 and not self._options.nested
+        if self.stage.level > 0 and not builds_on:
+            return
+        rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)
+        with self.record.after_archive("evaluation"), torch.no_grad():
+            self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
+            assert rendering.call is not None, "as it captures"
+            problem = explain_other_values(self._adapter, rendering.call, field)
+        if problem and builds_on:
+            raise UserInputError(f"{problem}; {NO_RESIDUALS}; level {self.stage.level} is in the run folder")
+        self._context.warn_of_other_images(problem)
 
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""

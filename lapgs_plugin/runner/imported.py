@@ -33,7 +33,6 @@ from lapgs_plugin.files import BARE_RECORD, one_line_errors
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
-from lapgs_plugin.rasterizers.extensions import CONSTANTS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runner.manifest import scene_reference
 from lapgs_plugin.runs.archive import RunArchive
@@ -301,8 +300,7 @@ def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str
 
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     for name, value in settings.items():
-        wanted = {"mult": (int, float), "antialiasing": (bool,)}.get(name)
-        if wanted is None or name not in CONSTANTS or type(value) not in wanted:
+        if type(value) not in {"mult": (int, float), "antialiasing": (bool,)}.get(name, ()):
             raise UserInputError(f"--set {name}={value}: expected mult=NUMBER or antialiasing=true|false")
     return settings
 

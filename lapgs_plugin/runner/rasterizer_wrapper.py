@@ -8,15 +8,17 @@ with: its matrices may be copied, moved or made anew on the way to the rasterize
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
-from types import ModuleType
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runner.signed_calls import signed_settings
@@ -30,12 +32,14 @@ class _RendererCall:
     Attributes:
         way: the renderer, and whether its arguments ask it to evaluate SH itself; None outside of renderers.
         key: key of the view; None for other cameras.
+        place: file and line of the call.
         given: values of each Gaussian (n, k) among its arguments, such as colours to render instead.
         done: not empty once the model's colours were rasterized.
     """
 
     way: tuple[Callable[..., Any], bool] | None = None
     key: str | None = None
+    place: str = "the checkout"
     given: tuple[Tensor, ...] = ()
     done: list[bool] = field(default_factory=list)
 
@@ -69,7 +73,11 @@ class RasterizerWrapper:
             key = next((key for v in given if (key := view_key(v)) is not None), outer.key)
             values = tuple(v for v in given if isinstance(v, Tensor) and v.ndim == 2)
             way = original, any(getattr(v, "convert_SHs_python", False) is True for v in given)
-            self.running = _RendererCall(way, key, (*outer.given, *values))
+            place = outer.place
+            if outer.way is None:
+                caller = sys._getframe(1)
+                place = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
+            self.running = _RendererCall(way, key, place, (*outer.given, *values))
             try:
                 return original(*args, **kwargs)
             finally:
@@ -77,9 +85,15 @@ class RasterizerWrapper:
 
         return render
 
-    def renderers(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout holds its renderers, as owners and names, each with its replacement's maker."""
-        return [(*place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+    def replacements(self, profile: Profile, consumer: str) -> list[Replacement]:
+        """Return replacements where a checkout holds its renderers, and looks rasterizers and their settings up."""
+        found = [(place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+        for rasterizer in profile.rasterizers:
+            for name in (*rasterizer.settings, *rasterizer.entries):
+                make = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
+                make = self.settings if name in rasterizer.settings else make
+                found += [(place, make) for place in profile.places(rasterizer, name)]
+        return [Replacement(*place, make, consumer) for place, make in found]
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the settings' constructor."""
@@ -95,15 +109,6 @@ class RasterizerWrapper:
             return signed_settings(settings, rendering.path, self._zero_background) if rendering.signed else settings
 
         return make_settings
-
-    def entries(self, profile: Profile) -> list[tuple[ModuleType, str, Callable[..., Any]]]:
-        """Return where a checkout looks rasterizers up, as owners and names, each with its replacement's maker."""
-        return [
-            (*place, self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function)
-            for rasterizer in profile.rasterizers
-            for name in rasterizer.entries
-            for place in profile.places(rasterizer, name)
-        ]
 
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
@@ -140,8 +145,8 @@ class RasterizerWrapper:
                 return outputs
 
             if not _has_model_colors(inputs, running, self._ways_of_sh):
-                return rendering.render_other(marked, inputs, settings)
-            return rendering.render(marked, inputs, settings, running.key)
+                return rendering.render_other(marked, inputs, settings, running.place)
+            return rendering.render(marked, inputs, settings, running.key, running.place)
 
         return call
 

@@ -156,8 +156,7 @@ class BareRunRecorder:
             assert rendering.captured is not None, "render() rasterizes"
             return rendering.captured, camera.original_image.to(rendering.captured.device)
 
-        found = [*wrapper.renderers(self._adapter.profile), *wrapper.entries(self._adapter.profile)]
-        with Attachment([Replacement(owner, name, make, "render()") for owner, name, make in found]):
+        with Attachment(wrapper.replacements(self._adapter.profile, "render()")):
             return mean_quality(map(rendered, self._scene.getTestCameras()))
 
     def _image_bytes(self) -> int:

@@ -50,7 +50,7 @@ class StageReplacements:
                 Replacement(camera, "__init__", self._context.images.adopting, "the scene's loader, for every image")
                 for camera in profile.cameras
             ),
-            *self._in_rendering(profile),
+            *self._context.wrapper.replacements(profile, "the training loop, score functions and reports"),
             *timing_replacements(profile, self._running),
             *self._in_model(profile),
             *adapter.replacements(self._in_residual),
@@ -59,7 +59,7 @@ class StageReplacements:
         ]
 
     def _running(self) -> ActiveStage | None:
-        stage: ActiveStage | None = self._context.running.stage
+        stage: ActiveStage | None = self._context.stage
         return stage
 
     def _in_residual(self) -> bool:
@@ -72,16 +72,6 @@ class StageReplacements:
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
         ]
-
-    def _in_rendering(self, profile: Profile) -> list[Replacement]:
-        consumer = "the training loop, score functions and reports"
-        wrapper = self._context.wrapper
-        found = wrapper.renderers(profile)
-        for rasterizer in profile.rasterizers:
-            for name in rasterizer.settings:
-                found += [(*place, wrapper.settings) for place in profile.places(rasterizer, name)]
-        found += wrapper.entries(profile)
-        return [Replacement(owner, name, make, consumer) for owner, name, make in found]
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
         control = dict.fromkeys(profile.density_control, self._make_density_control)

@@ -9,11 +9,8 @@ from typing import Any
 from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
 from lapgs_plugin.options import option, require_positive
 
-IN_MANIFEST = ("levels", "grid", "supervision", "inherit", "seed", "masks")
-"""Settings that the manifest has fields of its own for."""
-
-NOT_IN_MANIFEST = ("dry_run",)
-"""Settings that change no result."""
+ELSEWHERE = ("levels", "grid", "supervision", "inherit", "seed", "masks", "dry_run")
+"""Settings that a manifest has fields of its own for, and one that changes no result."""
 
 
 @dataclass(frozen=True)
@@ -69,4 +66,4 @@ class RunSettings(HierarchySettings):
 
     def for_manifest(self) -> dict[str, Any]:
         """Return what the manifest has under "settings"."""
-        return {name: value for name, value in self.resolved().items() if name not in (*IN_MANIFEST, *NOT_IN_MANIFEST)}
+        return {name: value for name, value in self.resolved().items() if name not in ELSEWHERE}

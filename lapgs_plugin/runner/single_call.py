@@ -17,13 +17,12 @@ import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS
-from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
-from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +93,8 @@ class SingleCall:
                 self._run_from(stage.window.start)
             else:
                 self._call.run()
-            self._require_trained(self._stage)
+            level, done = self._stage.stage.level, self._stage.window.start + self._stage.iteration
+            self._stage.require_trained(done, self._plan.iterations, ended=level == 0)
             self._stage.finish()
         except torch.cuda.OutOfMemoryError as error:
             raise self._stage.out_of_memory(error) from error
@@ -102,7 +102,7 @@ class SingleCall:
             self._explain_failure(self._stage)
             raise
         finally:
-            self._context.running.stage = None
+            self._context.stage = None
             self._stage.close()
 
     def _explain_failure(self, stage: NestedStage) -> None:
@@ -127,7 +127,7 @@ class SingleCall:
         given = self._run.call.opt
         for name in self._context.adapter.densify_thresholds(given):
             setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
-        self._context.running.stage = stage
+        self._context.stage = stage
         stage.load_images()
         stage.begin()
 
@@ -174,20 +174,3 @@ class SingleCall:
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
             self._call.changed(**dict.fromkeys(takes, str(path))).run()
-
-    def _require_trained(self, stage: ActiveStage) -> None:
-        """Check that the finest level was trained.
-
-        Raises:
-            LapgsError: no iteration was seen, or the call ended in a coarser level.
-        """
-        trained, total = stage.window.start + stage.record.iteration, self._plan.iterations
-        name = self._call.function.__name__
-        if stage.stage.level > 0 or stage.record.iteration == 0:
-            raise LapgsError(
-                f"{name}() ended after {trained} of {total} iterations, in level {stage.stage.level}; expected "
-                f"one call of {CLOCK}, or one step of the positions, an iteration; train this checkout with `lapgs run "
-                "--off`, or with as many --iterations as it runs"
-            )
-        if trained != total:
-            logger.warning("%s() ran %d iterations, expected %d as --iterations says", name, trained, total)

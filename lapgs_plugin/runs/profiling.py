@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -74,17 +74,20 @@ class PeakMemory:
         return dict(self._bytes)
 
 
-class Clock(Protocol):
-    """Make time stamps of a device's work for a `Breakdown`."""
+class Clock:
+    """Make time stamps of a processor's work, which is done when its call returns."""
 
     def stamp(self) -> Any:
         """Return this moment in the device's work."""
+        return time.perf_counter()
 
     def passed(self, stamp: Any) -> bool:
         """Return whether the device has reached a moment; a GPU's work may lag behind."""
+        return True
 
     def between(self, begin: Any, end: Any) -> float:
         """Return the seconds between two moments that were reached."""
+        return float(end - begin)
 
     def wait(self) -> None:
         """Wait until every moment was reached."""
@@ -93,26 +96,7 @@ class Clock(Protocol):
         """Take back a stamp that is not needed any more."""
 
 
-class ProcessorClock:
-    """Read `time.perf_counter`: a processor's work is done when its call returns."""
-
-    def stamp(self) -> float:
-        return time.perf_counter()
-
-    def passed(self, stamp: float) -> bool:
-        return True
-
-    def between(self, begin: float, end: float) -> float:
-        return end - begin
-
-    def wait(self) -> None:
-        pass
-
-    def release(self, stamp: float) -> None:
-        pass
-
-
-class StreamClock:
+class StreamClock(Clock):
     """Record events in a CUDA device's current stream without waiting: they time its work and the gaps in it."""
 
     def __init__(self, device: torch.device) -> None:
@@ -149,7 +133,7 @@ class Breakdown:
 
     def __init__(self, clock: Clock | None = None, seconds: Mapping[str, float] | None = None) -> None:
         self.measures = clock is not None
-        self._clock: Clock = clock or ProcessorClock()
+        self._clock = clock or Clock()
         self._seconds = dict.fromkeys(PARTS, 0.0) | dict(seconds or {})
         self._marks: deque[tuple[str | None, Any]] = deque()
         self._within = False
@@ -209,4 +193,4 @@ def breakdown_on(device: torch.device, seconds: Mapping[str, float] | None = Non
 
 def clock_on(device: torch.device) -> Clock:
     """Return the clock of a device's work."""
-    return StreamClock(device) if device.type == "cuda" else ProcessorClock()
+    return StreamClock(device) if device.type == "cuda" else Clock()

@@ -65,7 +65,7 @@ class MetricsOfLevel(StrictWithMore):
 
 
 class Metrics(_Distances):
-    """The metrics of a run, as far as `evaluation.figures.run_figures` measured them."""
+    """The metrics of a run, as far as `evaluation.figures` describes them."""
 
     psnr: NotRequired[float]
     fitted_psnr: NotRequired[float]

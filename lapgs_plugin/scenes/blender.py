@@ -40,7 +40,7 @@ TEST_FILE = "transforms_test.json"
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 SHORTEST_FOCAL = 1e-3
-"""Shortest focal length in sides of the image. Files with angles in other units than radians have shorter ones."""
+"""Shortest focal length in sides of the image."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -242,7 +242,12 @@ def read_camera(values: Values, where: str) -> Camera:
         raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export it again") from error
     if fx is None or fy is None:
         raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export it again")
-    for focal, side in ((fx, width), (fy, height)):
+    for axis, focal, side in (("x", fx, width), ("y", fy, height)):
+        angle = None if f"fl_{axis}" in values else values.get(f"camera_angle_{axis}")
+        if angle is not None and float(angle) > math.pi:
+            raise SceneError(
+                f"{where} has camera_angle_{axis} {float(angle):g}, expected radians, less than 3.14; export it again"
+            )
         if 0.0 < focal < SHORTEST_FOCAL * side:
             raise SceneError(
                 f"{where} has a focal length of {focal:g} pixels for {side:.6g} of the image, expected more than a "

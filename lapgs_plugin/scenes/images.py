@@ -310,6 +310,8 @@ def _open(path: Path) -> oiio.ImageInput:
         )
     if not is_file(path):
         raise missing_image(path)
+    if str(path).encode(errors="replace").decode() != str(path):
+        raise SceneError(f"{path}: its name is not UTF-8; rename it and reconstruct or export again")
     require_readable(path)
     options = oiio.ImageSpec()
     # Without it, 8-bit colour is multiplied by alpha in 8 bits, which loses precision where alpha is small.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import torch
 from PIL import Image
@@ -20,6 +20,11 @@ AUTO, NONE, ALPHA = "auto", "none", "alpha"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 HEIC = (".heic", ".heif", ".hif")
 """Photos of phones that neither COLMAP nor OpenImageIO reads."""
+
+
+def has_photo_suffix(file: PurePath) -> bool:
+    """Return whether a file is a photo by its name."""
+    return file.suffix.lower() in (*SUFFIXES, *HEIC)
 
 
 def resolve_masks(scene: Path, setting: str) -> str:
@@ -47,8 +52,8 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     Raises:
         SceneError: an image has no mask, or several.
     """
-    top, _, _ = names[0].partition("/")
-    common = f"{top}/" if all(name.startswith(f"{top}/") for name in names) else ""
+    tops = {name[: name.find("/") + 1] for name in names}  # "" of a name without a folder
+    common = tops.pop() if len(tops) == 1 else ""
     shorter = {name: name.removeprefix(common) for name in names}
     parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
     places = [place for parent in parents if is_folder(place := folder / parent)]
@@ -97,7 +102,7 @@ def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | 
 
 def _stem(name: str) -> str:
     path = PurePosixPath(name)
-    return path.with_suffix("").as_posix() if path.suffix.lower() in (*SUFFIXES, *HEIC) else name
+    return path.with_suffix("").as_posix() if has_photo_suffix(path) else name
 
 
 def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:

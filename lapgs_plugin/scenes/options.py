@@ -18,15 +18,17 @@ class SceneOptions:
         UserInputError: the background is no colour.
     """
 
-    resolution: str = option(
-        "full", "Image size: 1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4."
-    )
-    images: str = option("images", "Image folder of a COLMAP scene, such as images_4.")
     eval: bool = option(False, "Hold out every eighth view for `lapgs eval`; of a Blender scene its test views.")
+    resolution: str = option(
+        "full",
+        "Image size: 1k, 2k or 4k as in the paper, full, a width such as 800, a fraction such as 1/4, or 3dgs:N as the "
+        "option -r N of 3DGS codebases.",
+    )
+    images: str = option("images", "Image folder of the scene, such as images_4.")
     masks: str = option(
         "auto",
         "Masks of the photos: a folder of images that are black where a photo is ignored, alpha (the photos' own alpha "
-        "channels), none, or auto (the scene's folder masks/ if there is one).",
+        "channels), none, or auto (the scene's folder masks/, or mask_path of transforms.json, or none).",
     )
     background: str = option(
         "black", "Background of renders and of transparent pixels: black, white or R,G,B from 0 to 1."

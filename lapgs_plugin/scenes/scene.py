@@ -26,6 +26,7 @@ from lapgs_plugin.scenes.masks import (
     NONE,
     alpha_mask,
     find_masks,
+    has_photo_suffix,
     read_mask,
     refuse_photos,
     resolve_masks,
@@ -36,6 +37,9 @@ from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1
+FAR = 1e3
+"""Distance of the cameras from the origin, in extents, from which on positions are rounded to a tenth of a pixel of 1K
+images. Models in coordinates of a map are further away."""
 
 logger = logging.getLogger(__name__)
 
@@ -205,8 +209,15 @@ def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
 
 def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     """Return the frames and points of a scene folder, after checks."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise SceneError(f"{path}: not UTF-8, as which images are opened by name; rename the folder") from error
     if not is_folder(path):
-        raise SceneError(f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json")
+        raise SceneError(
+            f"{path}: no such scene folder; give the folder that holds sparse/ or transforms.json, or make one from "
+            "photos or a video with `lapgs prepare PHOTOS OUT`"
+        )
     if (model := find_model(path)) is not None:
         source = read_colmap(path, model, images, evaluate)
     elif has_transforms(path):
@@ -224,8 +235,8 @@ def _what_to_give(path: Path) -> str:
     folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
-    known = (path / name for name in ("keyframes/images", "images", "input"))  # the first is Polycam's
-    photos = next((str(folder) for folder in known if is_folder(folder)), "PHOTOS")
+    known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
+    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 
@@ -286,5 +297,11 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
     if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
         raise SceneError(
             f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
+        )
+    if (away := float(centers.mean(dim=0).norm())) > FAR * extent:
+        logger.warning(
+            "%s: the cameras are %.3g from the origin, %.3g times the scene's extent, where float32 numbers are %.1g "
+            "apart: fine detail is lost; move the model to the origin, for example with COLMAP's model_transformer",
+            *(path, away, away / extent, np.spacing(np.float32(away))),
         )
     return extent

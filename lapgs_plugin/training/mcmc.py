@@ -90,7 +90,8 @@ class McmcDensifier(DensityControl):
             model.overwrite(places, chosen)
 
     def _add(self, model: TrainableField) -> None:
-        count = min(self._most, int(self._growth * len(model))) - len(model)
+        grown = max(int(self._growth * len(model)), len(model) + 1)  # 5 % of fewer than 20 Gaussians are none
+        count = min(self._most, grown) - len(model)
         if count > 0:
             chosen = _sample(torch.sigmoid(model.params["opacities"]), count)
             _share(model, chosen)

@@ -18,6 +18,7 @@ from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
+from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
@@ -84,9 +85,10 @@ def merge_levels(
         renderer, scene = run_renderer(archive), run_scene(archive, moved_to)
         teacher = _composed(renderer, scene)
         start = first_field(fields)
-        settings = _settings(manifest, start.sh_degree, iterations)
+        name = choose_rasterizer(AUTO)
+        settings = _settings(manifest, start.sh_degree, iterations, on_gsplat=name == gsplat.NAME)
         reference = replace(manifest.scene, eval=True)
-        placed = training_rasterizer(choose_rasterizer(AUTO), settings)
+        placed = training_rasterizer(name, settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
         with RunArchive.create(Path(scratch) / "run", empty) as fitted:
             trainer = Trainer(
@@ -136,7 +138,7 @@ def _padded(sh: torch.Tensor, count: int) -> torch.Tensor:
     return torch.cat([sh, sh.new_zeros(len(sh), count - sh.shape[1], 3)], dim=1)
 
 
-def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSettings:
+def _settings(manifest: Manifest, sh_degree: int, iterations: int, on_gsplat: bool) -> TrainSettings:
     return TrainSettings(
         iterations=iterations,
         levels=1,
@@ -147,7 +149,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSetti
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
         densification=Densification(until=0, reset_every=0, strategy=GRADIENTS),  # the field stays as it is
-        antialiased=bool(manifest.settings.get("antialiased", False)),
+        antialiased=on_gsplat and bool(manifest.settings.get("antialiased", False)),
     )
 
 

@@ -272,6 +272,8 @@ class TrainSettings(HierarchySettings):
         """Refuse settings of a base if there is none, or if the next level inherits all of its coefficients."""
         if (share := self.densification.base_share) is not None and self.levels == 1:
             raise UserInputError(f"--base-densify-share {share}: one level has no base; give --densify-until")
+        if (most := getattr(self.densification.options, "base_cap_max", None)) is not None and self.levels == 1:
+            raise UserInputError(f"--base-cap-max {most}: one level has no base; give --cap-max")
         if (degree := self.base_sh_degree) is None:
             return
         if self.nested:

@@ -17,6 +17,7 @@ from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
+from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT
@@ -128,7 +129,7 @@ class Trainer:
         """
         context, plan = self._context, self._context.plan
         checkpoint = self._checkpoint() if resume else None
-        with stop_request() as stop:
+        with one_pool(), stop_request() as stop:
             try:
                 joint = any(self.settings.joint_from(stage) is not None for stage in plan)
                 residuals = any(stage.signed for stage in plan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,14 @@ def test_names_with_escape_sequences(
     change(scene, 3, file_path="\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp")
     line = refused(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run")
     assert r"\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp: no such image" in line
+
+
+def test_a_folder_whose_name_is_not_utf8(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / os.fsdecode(b"scene\xff")
+    line = refused(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run", "--rasterizer", "cpu")
+    assert r"scene\udcff: not UTF-8" in line
 
 
 def test_the_table_of_views_prints_names_as_they_are_spelt(capsys: pytest.CaptureFixture[str]) -> None:

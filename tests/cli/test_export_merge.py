@@ -71,6 +71,16 @@ def test_a_run_that_compensates_exposure_is_compared_with_photos_after_a_colour_
     assert float(before) == pytest.approx(fmean(fitted), abs=0.01)
 
 
+def test_an_antialiased_run_is_merged_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only gsplat trains antialiased; the CPU rasterizer renders such a run and fits the field."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["settings"] |= {"antialiased": True, "raster": {"antialiasing": True}}
+    (run / "manifest.json").write_text(json.dumps(manifest | {"rasterizer": "gsplat"}))
+    assert "dB PSNR" in lapgs_export(run, "--merge", "--iterations", 2)
+
+
 def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its opacities and sizes are right already, and nothing is to shake the positions."""
     found = []

@@ -147,7 +147,7 @@ def test_charts_show_both_runs_over_time_and_iterations(run: Path, baseline: Pat
     titles = ("Loss", "Held-out PSNR (dB)", "Gaussians in training")
     assert labels == [
         *(f"{title} over {x}" for x in ("seconds of optimization", "iterations, all stages") for title in titles),
-        "Optimization (s) against Gaussians over Gaussians, mean of levels by iterations",
+        "Optimization (s) against Gaussians over Gaussians of levels, weighted by iterations",
     ]
     # Loss and Gaussians have a line a stage, PSNR one a run; all twice. PSNR was measured too rarely for an inset.
     assert Counter(line["class"] for line in page.all("polyline")) == {"line-run": 2 * 5, "line-baseline": 2 * 3}

@@ -95,6 +95,12 @@ def test_a_checkout_with_other_names_trains_to_the_same_bits(copy: Path, scene: 
                 for old, new in names.items():
                     text = re.sub(rf"(?<![\w.'\"]){old}\b|(?<=gaussians\.){old}\b", new, text)
                 path.write_text(text, encoding="utf-8")
+            # Some keep an argument of the model in a local variable.
+            edit(
+                copy / "graphdeco" / "train.py",
+                "    gaussians = GaussianModel(",
+                "    kind = settings.optimizer_type\n    gaussians = GaussianModel(",
+            )
         folder, script = tmp_path / name, copy / "graphdeco" / "train.py"
         more = ("--iterations", 15)
         with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, *more, script=script) as adapter:

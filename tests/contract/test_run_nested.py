@@ -338,18 +338,27 @@ def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(
     assert RunArchive.open(tmp_path / "run").available_levels == (1,)
 
 
-def test_a_loop_that_ends_early_says_where(scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("hierarchy", "iterations"), [("nested", 20), ("laplacian", 0), ("laplacian", 8)])
+def test_a_loop_that_ends_early_says_where(
+    hierarchy: str, iterations: int, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter:
         training = adapter.train.training
 
         @wraps(training)
         def short(**values: Any) -> None:
-            values["opt"].iterations = 20
+            values["opt"].iterations = iterations
             training(**values)
 
         adapter.train.training = short
-        with pytest.raises(LapgsError, match=r"ended after 20 of 90 iterations, in level 1; expected"):
-            drive(adapter, **THIRDS)
+        if iterations == 8:
+            drive(adapter, hierarchy=hierarchy, joint=0.0)
+            warned = [each.getMessage() for each in caplog.records if "expected" in each.getMessage()]
+            assert warned == [f"training() ran 8 iterations, expected {n} as --iterations says" for n in (30, 60)]
+            return
+        of = 90 if hierarchy == "nested" else 30
+        with pytest.raises(LapgsError, match=rf"ended after {iterations} of {of} iterations, in level 1; expected"):
+            drive(adapter, hierarchy=hierarchy, **THIRDS)
 
 
 def test_tamings_budget_is_the_whole_runs(run_of: Callable[[str], tuple[RunArchive, Seen]]) -> None:

@@ -13,6 +13,7 @@ import torch
 import lapgs_plugin as lapgs
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import render_transmittance
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from tests.cli.run_folder import write_run, write_scene
@@ -44,7 +45,7 @@ def executed(name: str, text: str | None = None) -> dict[str, Any]:
 
 
 def test_every_program_has_a_test() -> None:
-    assert FILES.keys() == {"read_a_run.py", "merge_a_run.py", "my_loop.py", "pyramids.py"}
+    assert FILES.keys() == {"read_a_run.py", "merge_a_run.py", "my_loop.py", "train_with_a_hook.py", "pyramids.py"}
 
 
 def test_a_run_is_read(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,6 +98,21 @@ def test_the_loop_trains_and_continues(
     torch.testing.assert_close(lapgs.run_renderer(run).render(view.camera).image, trained, rtol=0, atol=1e-5)
     with pytest.raises(RunFolderError, match="not started by `lapgs train`"):
         settings_from_manifest(run.manifest)
+
+
+def test_the_trainer_takes_a_hook_with_an_argument(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(sample, "data/mine")
+    program = executed("train_with_a_hook.py")
+    for weight in (0.0, 9.0):
+        program["main"](f"runs/{weight:g}", weight, iterations=40, sh_degree=0, exposure="off")
+    without, filled = (lapgs.RunArchive.open(f"runs/{weight}") for weight in (0, 9))
+    assert settings_from_manifest(filled.manifest).iterations == 40
+    camera = lapgs.level_camera(lapgs.run_scene(filled).train[0].camera, 1)
+    opacities = [1.0 - render_transmittance(lapgs.CpuRasterizer(), run.field(1), camera) for run in (without, filled)]
+    assert opacities[1].mean() > opacities[0].mean() + 0.01  # 0.023 seen
 
 
 def test_pyramids_are_used_alone() -> None:

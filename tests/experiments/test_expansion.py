@@ -196,6 +196,7 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        ([], []),
         (["--mult", "0.7", "--mult", "0.5"], ["--set", "mult=0.5"]),
         (["--mult=0.7", "--dense=0.1"], ["--set", "mult=0.7"]),
         (["--antialiasing", "-r", "2"], ["--set", "antialiasing=true"]),

@@ -15,7 +15,7 @@ from lapgs_plugin.runs.profiling import (
     PARTS,
     UNREAD_EVENTS,
     Breakdown,
-    ProcessorClock,
+    Clock,
     breakdown_on,
 )
 
@@ -110,7 +110,7 @@ def test_marks_are_read_without_waiting_after_the_work() -> None:
 
 
 def test_parts_of_known_sleeps() -> None:
-    breakdown = Breakdown(ProcessorClock())
+    breakdown = Breakdown(Clock())
     start = time.perf_counter()
     for part, seconds in (("forward", 0.03), ("loss", 0.01), ("backward", 0.06), ("forward", 0.02)):
         breakdown.mark(part)

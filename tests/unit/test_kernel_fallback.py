@@ -22,7 +22,7 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.ops.self_check import SelfCheck
 from lapgs_plugin.ops.upsample import upsample_add
-from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat import rasterizer as rasterizer_module
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
@@ -124,7 +124,7 @@ def test_adam(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
 
 
 def test_blending(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(direct, "compiled_functions", Compiled)
+    monkeypatch.setattr(bindings, "compiled_functions", Compiled)
     name = "lapgs_plugin.rasterizers.gsplat.blend_kernels"
     monkeypatch.setitem(sys.modules, name, broken("blend_forward", "blend_backward"))
     assert not our_kernels_blend(torch.zeros(1, 3), 1_000_000)

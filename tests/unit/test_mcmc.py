@@ -161,6 +161,11 @@ def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
         control.after_step(model, iteration, None, camera)
         counts.append(len(model))
     assert counts == [210, 210, 215, 215], "5 % each 100 iterations"
+    few = trained_once(3)
+    few.optimizers["means"].param_groups[0]["lr"] = 0.0
+    for iteration in (600, 700):
+        control.after_step(few, iteration, None, camera)
+    assert len(few) == 5, "one at least"
     again = CpuRasterizer()(model.field.detach(), camera, background=torch.zeros(3)).image
     assert (again - image).abs().mean() < 0.004  # worst seen 0.0013
 
@@ -222,6 +227,8 @@ def test_options_of_both_are_refused() -> None:
         TrainSettings(prune=0.01, densification=Densification(options=Auto(cap_max=9, grow_grad2d=1e-4)))
     with pytest.raises(UserInputError, match=r"--base-cap-max is an option .* does not take --protocol paper"):
         TrainSettings(protocol="paper", densification=Densification(options=Auto(base_cap_max=9)))
+    with pytest.raises(UserInputError, match="--base-cap-max 9: one level has no base; give --cap-max"):
+        TrainSettings(levels=1, densification=Densification(options=Auto(base_cap_max=9)))
     with pytest.raises(UserInputError, match=r"--densify-threshold 0\.0: expected a positive gradient"):
         TrainSettings(densification=Densification(options=Auto(grow_grad2d=0.0)))
     with pytest.raises(UserInputError, match="--strategy mcmc with --protocol paper: the paper has 3dgs"):

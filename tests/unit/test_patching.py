@@ -57,24 +57,22 @@ void Box :: shade ( ) { if ( deg > 0 ) { } }
 """,
 }
 DEG = "if (deg > 0)"
+SHADE, HOST = "kernels/shade.cu", "kernels/host.h"
 EDITS = {
-    "strip": Edit("signed", "strip", Anchor("kernels/shade.cu", DEG, "shade"), "int flag = deg;\ndeg &= 7;", False),
-    "raw": Edit("signed", "raw", Anchor("kernels/shade.cu", "result += 0.5f;", "shade"), "if (flag) return 1;", False),
-    "max": Edit("build", "max", Anchor("kernels/shade.cu", "space::top(result, 0.0f)", "shade"), "most(result)", True),
-    "wide": Edit("build", "wide", Anchor("kernels/shade.cu", "#include <vector>"), "#include <cstdint>", False),
-    "guard": Edit(
-        "build", "guard", Anchor("kernels/host.h", "namespace kernels"), "/* why */\nint b;\n#if 1\n#endif", False
-    ),
+    "strip": Edit("signed", "strip", SHADE, DEG, "shade", before="int flag = deg;\ndeg &= 7;"),
+    "raw": Edit("signed", "raw", SHADE, "result += 0.5f;", "shade", before="if (flag) return 1;"),
+    "max": Edit("build", "max", SHADE, "space::top(result, 0.0f)", "shade", replace="most(result)"),
+    "wide": Edit("build", "wide", SHADE, "#include <vector>", before="#include <cstdint>"),
+    "guard": Edit("build", "guard", HOST, "namespace kernels", before="/* why */\nint b;\n#if 1\n#endif"),
 }
-CHECK = Check("signed", Anchor("kernels/shade.cu", "int deg", "shade"), 1, "the degree is taken by value")
+CHECK = Check("signed", "int deg", 1, "the degree is taken by value", (Anchor(SHADE, function="shade"),))
 RECIPE = Recipe(
     name="shade",
     title="a small shader",
-    present=(Anchor("kernels/shade.cu", ""),),
-    absent=(),
+    present=(Anchor(SHADE),),
     reinstall="make {folder}",
-    edits=tuple(EDITS.values()),
-    checks=(CHECK,),
+    edit=tuple(EDITS.values()),
+    check=(CHECK,),
 )
 
 
@@ -185,10 +183,10 @@ def expected(file: str, sets: set[str]) -> str:
     """Return a patched file without comments and white space, made by inserting each text by token index."""
     program = PARSED[file]
     tokens = list(program.tokens)
-    edits = [edit for edit in EDITS.values() if edit.anchor.file == file and edit.set in sets]
+    edits = [edit for edit in EDITS.values() if edit.file == file and edit.set in sets]
     for edit in sorted(edits, key=lambda edit: program.anchors[edit.name].start, reverse=True):
         place = program.anchors[edit.name]
-        tokens[place.start : place.stop if edit.replaces else place.start] = [edit.put]
+        tokens[place.start : place.start if edit.replace is None else place.stop] = [edit.put]
     return bare("\n".join(tokens).encode())
 
 
@@ -241,7 +239,7 @@ def test_a_tree_without_any_one_anchor_is_refused_and_untouched(root: Path, data
 
 @pytest.mark.parametrize("name", EDITS)
 def test_an_anchor_that_stands_twice_is_refused(root: Path, name: str) -> None:
-    file = EDITS[name].anchor.file
+    file = EDITS[name].file
     program = PARSED[file]
     place = program.anchors[name]
     tokens = [*program.tokens[: place.stop], ";", *program.tokens[place.start :]]
@@ -395,12 +393,12 @@ def test_a_set_that_is_opt_in_goes_in_by_name_only_and_out_with_all(target: Targ
 
 
 def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, bytes]) -> None:
-    older = Recipe(**{**vars(RECIPE), "edits": (Edit("signed", "old", EDITS["raw"].anchor, "return 2;", False),)})
+    older = replace(RECIPE, edit=(replace(EDITS["raw"], name="old", before="return 2;"),))
     write_all(plan_apply(Target(older, target.folder), ["signed"]))
     assert {found.set: found.state for found in status(target)}["signed"] is State.INCOMPLETE
     renewed = apply(target, "signed")
     assert renewed == apply(write_tree(target.folder, tree), "signed")
-    newer = Recipe(**{**vars(RECIPE), "edits": (EDITS["guard"],)})
+    newer = replace(RECIPE, edit=(EDITS["guard"],))
     with pytest.raises(PatchError, match="signed is not among its sets of edits"):
         plan_apply(Target(newer, target.folder), ["build"])
 
@@ -719,7 +717,7 @@ def test_every_recipe_has_a_way_to_reinstall_and_edits_with_different_names() ->
         "graphdeco-accel",
     }
     for recipe in recipes:
-        names = [(edit.set, edit.name) for edit in recipe.edits]
+        names = [(edit.set, edit.name) for edit in recipe.edit]
         assert len(names) == len(set(names))
         assert "{folder}" in recipe.reinstall
         assert "build-cuda13" in recipe.sets
@@ -836,12 +834,12 @@ def test_a_header_that_the_source_has_is_not_included_again(rasterizer: Path, ha
 
 @pytest.mark.parametrize("recipe", ["simple-knn", "taming-rasterizer", "fastgs", "taming"])
 def test_float_limits_are_included_once(tmp_path: Path, recipe: str) -> None:
-    (edit,) = (each for each in {r.name: r for r in load_recipes()}[recipe].edits if each.name == "cfloat")
-    only = Recipe("only", "only", (Anchor(edit.anchor.file, ""),), (), "", (edit,), ())
-    path = tmp_path / edit.anchor.file
+    (edit,) = (each for each in {r.name: r for r in load_recipes()}[recipe].edit if each.name == "cfloat")
+    only = Recipe("only", "only", (Anchor(edit.file),), edit=(edit,))
+    path = tmp_path / edit.file
     path.parent.mkdir(parents=True, exist_ok=True)
     for own, times in (("", 1), ("#include <cfloat>\n", 1), ("#include <float.h>\n", 0)):
-        path.write_text(own + edit.anchor.find + "\n")
+        path.write_text(own + edit.find + "\n")
         before = path.read_bytes()
         for _ in range(2):
             write_all(plan_apply(Target(only, tmp_path), [ALL_SETS]))
@@ -855,8 +853,8 @@ def test_a_header_included_twice_by_an_earlier_version_is_taken_out(rasterizer: 
     path.write_text("#include <cstdint>\n" + path.read_text())
     before = snapshot(rasterizer)
     (target,) = find_targets(rasterizer)
-    edits = tuple(replace(edit, unless=()) for edit in target.recipe.edits)
-    older = replace(target, recipe=replace(target.recipe, edits=edits))
+    edits = tuple(replace(edit, unless=()) for edit in target.recipe.edit)
+    older = replace(target, recipe=replace(target.recipe, edit=edits))
     write_all(plan_apply(older, ["build-cuda13"]))
     assert path.read_text().count("#include <cstdint>") == 2
     assert {found.set: found.state for found in status(target)}["build-cuda13"] is State.INCOMPLETE
@@ -899,8 +897,8 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
         ('name = "new"\ntitle = "New"\npresent = [3]', "present[0] is 3, expected"),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
-            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = "#include <f>"',
-            "expected a list of directives that start with #",
+            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = ["include"]',
+            "expected directives that start with #",
         ),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
@@ -924,8 +922,8 @@ def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> 
     (tmp_path / "base.toml").write_text(base)
     (tmp_path / "child.toml").write_text(child)
     found = load_recipes(tmp_path)[1]
-    assert [(e.name, e.put) for e in found.edits] == [("one", "3"), ("two", "2"), ("three", "4")]
-    assert (found.present, found.reinstall) == ((Anchor("y", ""),), "make {folder}")
+    assert [(e.name, e.put) for e in found.edit] == [("one", "3"), ("two", "2"), ("three", "4")]
+    assert (found.present, found.reinstall) == ((Anchor("y"),), "make {folder}")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -1017,10 +1015,8 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             assert {found.state for found in status(target)} <= {State.APPLIED, State.NOT_NEEDED}
             blocks = sum(data.count(b">>> lapgs") for data in after.values())
             spared = [
-                edit
-                for edit in target.recipe.edits
-                if any(each.encode() in before[edit.anchor.file] for each in edit.unless)
+                edit for edit in target.recipe.edit if any(each.encode() in before[edit.file] for each in edit.unless)
             ]
-            assert blocks == len(target.recipe.edits) - len(spared)
+            assert blocks == len(target.recipe.edit) - len(spared)
             assert apply(target, *target.recipe.sets) == after
             assert revert(target, ALL_SETS) == before

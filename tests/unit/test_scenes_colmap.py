@@ -369,9 +369,11 @@ def test_a_folder_around_a_scene_is_told_where_it_is(tmp_path: Path, name: str) 
 
 
 def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
-    (tmp_path / "keyframes" / "images").mkdir(parents=True)
+    write_images(tmp_path, {"one.png": (8, 8), "keyframes/images/1.png": (8, 8)})
     with pytest.raises(SceneError, match=r"make a scene from photos with `lapgs prepare \S+/keyframes/images OUT`"):
         load(tmp_path)
+    with pytest.raises(SceneError, match=r"`lapgs prepare \S+/keyframes/images OUT`"):
+        load(tmp_path / "keyframes" / "images")
 
 
 def test_wrong_resolution_comes_first(tmp_path: Path) -> None:

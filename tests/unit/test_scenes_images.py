@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -273,6 +274,13 @@ def test_names_that_no_file_can_have(tmp_path: Path) -> None:
     for name in ("a\0b.png", "\ud800.png"):
         with pytest.raises(SceneError, match="no such image"):
             read_image(tmp_path / name)
+
+
+def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"t\xfcr.png")
+    path.write_bytes(b"")
+    with pytest.raises(SceneError, match=r"t\\udcfcr\.png: its name is not UTF-8; rename it"):
+        read_image(path)
 
 
 # Files that are no images

@@ -350,6 +350,10 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ),
         ({"cx": -1e300}, r"principal point \(-1e\+300, 29.5\), expected at most"),
         ({"w": 1e19, "h": 1e19, "fl_x": 1e19, "fl_y": 1e19}, "1e.19 pixels wide or high, expected at most 2147483648"),
+        (
+            {"fl_x": None, "camera_angle_x": 40.0},
+            r"frame 0 .* has camera_angle_x 40, expected radians, less than 3\.14",
+        ),
         ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
         ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
         ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
@@ -374,6 +378,19 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
     scene = load(path)
     assert scene.train[0].name == "a.png"
     assert scene.train[0].camera.position[0].item() == pytest.approx(1e6)
+
+
+@pytest.mark.parametrize(("away", "warned"), [(1e3, False), (5e5, True)])
+def test_coordinates_of_a_map_are_told(
+    tmp_path: Path, away: float, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = capture(tmp_path)
+    for i, eye in enumerate(eyes(10)):
+        there = np.array([away, 0.0, 0.0])
+        edit(path, {"transform_matrix": look_at(eye + there, tuple(there)).tolist()}, in_frame=i)
+    load(path)
+    assert ("the cameras are 5e+05 from the origin" in caplog.text) == warned
+    assert ("numbers are 0.03 apart" in caplog.text) == warned
 
 
 @pytest.mark.parametrize(

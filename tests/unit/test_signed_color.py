@@ -24,7 +24,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.patching.engine import Target, plan_apply
 from lapgs_plugin.patching.files import write_all
-from lapgs_plugin.patching.recipe import Anchor, Edit, Recipe
+from lapgs_plugin.patching.recipe import Edit, Recipe
 from lapgs_plugin.rasterizers import extensions, signed_color
 from lapgs_plugin.rasterizers.extensions import CudaExtension, _ScreenPoints, installed_extensions
 from lapgs_plugin.rasterizers.signed_color import (
@@ -164,8 +164,8 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
     folder = tmp_path / "submodules" / "raster"
     (folder / "some_extension").mkdir(parents=True)
     (folder / "shade.cu").write_text("float shade() { return 0.5f; }\n")
-    edit = Edit("signed-color", "raw", Anchor("shade.cu", "return 0.5f"), "/* raw */", False)
-    recipe = Recipe("some", "Some", (), (), "pip install {folder}", (edit,), ())
+    edit = Edit("signed-color", "raw", "shade.cu", "return 0.5f", before="/* raw */")
+    recipe = Recipe("some", "Some", (), reinstall="pip install {folder}", edit=(edit,))
     found = Target(recipe, folder)
     monkeypatch.setattr(signed_color, "find_targets", lambda _: (found,))
     return found

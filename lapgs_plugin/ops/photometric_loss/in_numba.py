@@ -25,7 +25,7 @@ from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, absolute, fetch_add, fma, load, select, splat, store
 from lapgs_plugin.jit.threads import parallel
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_SIGMA, check_arguments
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, SSIM_WINDOW, check_arguments
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1 as C1
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C2 as C2
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_RADIUS as RADIUS
@@ -39,13 +39,7 @@ _BLOCK_COLUMNS = 400  # both buffers of a block fit a level-2 cache of 256 KiB i
 _STRIP_ROWS = 192  # a strip computes 20 rows of its neighbours again
 
 
-def _half_window() -> tuple[float, ...]:
-    gaussian = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SSIM_SIGMA**2))
-    return tuple((gaussian / gaussian.sum())[: RADIUS + 1].tolist())
-
-
-_W0, _W1, _W2, _W3, _W4, _W5 = _half_window()
-"""The normalised window from its tail to its centre."""
+_W0, _W1, _W2, _W3, _W4, _W5 = SSIM_WINDOW[: RADIUS + 1]  # from its tail to its centre
 
 
 @inline

@@ -8,7 +8,6 @@ three maps, the derivatives of SSIM by the local means; the gradient's kernel fi
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -17,7 +16,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_SIGMA, as_batch
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
 from lapgs_plugin.ops.self_check import FUSED
 
 COLORS = 3
@@ -25,12 +24,7 @@ BLOCK = 128
 MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 16, 1500
 """Rows of a program, which reads ten more. It takes fewer where an image would make less than so many programs."""
 
-TAPS = 2 * SSIM_RADIUS + 1
-_gauss = [math.exp(-((tap - SSIM_RADIUS) ** 2) / (2 * SSIM_SIGMA**2)) for tap in range(TAPS)]
-WINDOW = tuple(each / math.fsum(_gauss) for each in _gauss)
-"""The window of SSIM along one side."""
-
-CONSTANTS: dict[str, Any] = {"window": WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK, **FUSED}
+CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK, **FUSED}
 """Arguments of both kernels that they are compiled for."""
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.ops.self_check import largest, matches_reference
+from lapgs_plugin.rasterizers.gsplat import bindings
+from lapgs_plugin.rasterizers.gsplat.bindings import TILE
 
 SWITCH = "LAPGS_BLEND_GRADIENTS"
 TRITON, GSPLAT = "triton", "gsplat"
@@ -70,9 +72,7 @@ def blend(given: ToBlend, size: tuple[int, int], ours: bool) -> Blended:
 
         images, counts = blend_forward(*given, size)
         return Blended(images, images.new_empty(0), counts)
-    from lapgs_plugin.rasterizers.gsplat.direct import TILE, compiled_functions
-
-    forward = compiled_functions().rasterize_to_pixels_3dgs_fwd
+    forward = bindings.compiled_functions().rasterize_to_pixels_3dgs_fwd
     return Blended(*forward(*given[:5], None, *size, TILE, *given[5:]))
 
 
@@ -90,12 +90,10 @@ def gradients(given: ToBlend, blended: Blended, by_images: Tensor, absolute: boo
 
         rest = blended.last, blended.images, by_images
         return blend_backward(*given[:4], given.offsets, given.flat, *rest, absolute)
-    from lapgs_plugin.rasterizers.gsplat.direct import TILE, compiled_functions, zeros
-
     _, height, width, _ = by_images.shape
-    found: Gradients = compiled_functions().rasterize_to_pixels_3dgs_bwd(
+    found: Gradients = bindings.compiled_functions().rasterize_to_pixels_3dgs_bwd(
         *given[:5], None, width, height, TILE, *given[5:], blended.alphas, blended.last,
-        by_images, zeros(blended.alphas.shape, by_images.device), absolute,
+        by_images, bindings.zeros(blended.alphas.shape, by_images.device), absolute,
     )  # fmt: skip
     return found
 
@@ -103,8 +101,6 @@ def gradients(given: ToBlend, blended: Blended, by_images: Tensor, absolute: boo
 @matches_reference("blending by gsplat's kernels, which take longer", LARGEST_DIFFERENCE)
 def triton_works(device: torch.device) -> float:
     """Compare images and gradients by both for two views of random Gaussians, dense enough to hide what is behind."""
-    from lapgs_plugin.rasterizers.gsplat.direct import sort_into_tiles
-
     generator = torch.Generator().manual_seed(0)
     cameras, count, width, height = 2, 3000, 75, 53
 
@@ -121,7 +117,7 @@ def triton_works(device: torch.device) -> float:
     colors = torch.randn(cameras, count, 3, generator=generator)
     by_images = torch.randn(cameras, height, width, 3, generator=generator).to(device)
     projected = [value.to(device) for value in (radii, centres, uniform(cameras, count), conics)]
-    offsets, flat = sort_into_tiles(projected, (width, height), cameras)
+    offsets, flat = bindings.sort_into_tiles(projected, (width, height), cameras)
     values = centres, conics, colors, opacities, uniform(cameras, 3), offsets, flat
     given = ToBlend(*(value.to(device) for value in values))
     found = []

@@ -8,10 +8,7 @@ one.
 
 from __future__ import annotations
 
-import math
 import weakref
-from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import (
     Blended,
     ToBlend,
@@ -29,10 +27,7 @@ from lapgs_plugin.rasterizers.gsplat.blend_gradients import (
 )
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
-
-TILE = 16
-FAR_PLANE = 1e10
+from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
 
 
 class Intermediates(NamedTuple):
@@ -143,14 +138,19 @@ class _Render(torch.autograd.Function):
 
         means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
         given, blended = ToBlend(*rest[:7]), Blended(*rest[7:10])
-        found, (width, height), compiled = Intermediates(given, blended, *rest[10:]), ctx.size, compiled_functions()
+        found, (width, height), compiled = (
+            Intermediates(given, blended, *rest[10:]),
+            ctx.size,
+            bindings.compiled_functions(),
+        )
         by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
+        compiled = bindings.compiled_functions()
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
             compiled.CameraModelType.PINHOLE, found.radii, given.conics, None,
-            by_means2d, zeros(found.depths.shape, means.device), by_conics, None, False,
+            by_means2d, bindings.zeros(found.depths.shape, means.device), by_conics, None, False,
         )  # fmt: skip
         by_sh = finish_gradients(
             means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities,
@@ -172,12 +172,12 @@ def forward(
 
     size, count = (cameras.width, cameras.height), len(cameras.poses)
     scales, opacities = activate(log_scales, logits)
-    projected = project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
+    projected = bindings.project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
     radii, means2d, depths, conics = projected
     pixels = means2d if describes else None
     colors, visible_radii, centres = visible_colors(means, cameras.centres, sh, degree, signed, radii, pixels)
     opacities = _for_each_camera(opacities, count)
-    tiles = sort_into_tiles(projected, size, count)
+    tiles = bindings.sort_into_tiles(projected, size, count)
     given = ToBlend(means2d, conics, colors, opacities, background, *tiles)
     return Intermediates(given, blend(given, size, ours), radii, depths, scales, visible_radii, centres)
 
@@ -187,48 +187,6 @@ def _for_each_camera(values: Tensor, cameras: int) -> Tensor:
     return values.expand(cameras, -1).contiguous()
 
 
-def project(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, poses: Tensor, intrinsics: Tensor,
-    size: tuple[int, int],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Return radii (c, n, 2), centres (c, n, 2), depths (c, n) and conics (c, n, 3) of one or more activated Gaussians.
-
-    Args:
-        poses, intrinsics: (c, 4, 4) and (c, 3, 3).
-        size: (width, height) of the image.
-    """
-    compiled = compiled_functions()
-    radii, means2d, depths, conics, _ = compiled.projection_ewa_3dgs_fused_fwd(
-        means, None, quaternions, scales, opacities, poses, intrinsics, *size,
-        PIXEL_VARIANCE, NEAR_DEPTH, FAR_PLANE, 0.0, False, compiled.CameraModelType.PINHOLE,
-    )  # fmt: skip
-    return radii, means2d, depths, conics
-
-
-def sort_into_tiles(
-    projected: Sequence[Tensor], size: tuple[int, int], count: int = 1, of_image: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Sort Gaussians into tiles, front to back. This waits for the GPU, for the number of pairs with tiles.
-
-    Args:
-        projected: results of `project`; or, without the leading dimension, those of several images in one list.
-        size: (width, height) of all images.
-        count: number of images.
-        of_image: in a list, the image number (n,) of each Gaussian.
-
-    Returns:
-        The first pair of each tile, (count, tiles down, tiles across), and the Gaussian of each pair.
-    """
-    compiled = compiled_functions()
-    radii, means2d, depths, _ = projected
-    across, down = (math.ceil(side / TILE) for side in size)
-    # gsplat also takes the index of each Gaussian, but does not use it.
-    _, pairs, flat = compiled.intersect_tile(
-        means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
-    )
-    return compiled.intersect_offset(pairs, count, across, down), flat
-
-
 def _write_gradients(targets: GradientTargets, by_centre: Tensor, by_absolute: Tensor | None) -> None:
     """Write the gradients by centres, (n, 2) or (c, n, 2), to the tensors of a `RenderResult`."""
     held = [target() for target in targets]
@@ -236,18 +194,3 @@ def _write_gradients(targets: GradientTargets, by_centre: Tensor, by_absolute: T
         held[0].grad = by_centre
     if by_absolute is not None and len(held) > 1 and held[1] is not None:
         held[1].copy_(by_absolute)
-
-
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)  # cached for later calls, which may need gradients
-def zeros(shape: torch.Size, device: torch.device) -> Tensor:
-    """Return cached zeros, the gradients by unused outputs; they must not be written to."""
-    return torch.zeros(shape, device=device)
-
-
-@lru_cache(maxsize=1)
-def compiled_functions() -> Any:
-    """Return gsplat's module of compiled functions."""
-    from gsplat.cuda._backend import _C
-
-    return _C

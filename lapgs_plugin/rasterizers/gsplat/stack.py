@@ -23,9 +23,9 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
-from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat import bindings
+from lapgs_plugin.rasterizers.gsplat.bindings import TILE
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
-from lapgs_plugin.rasterizers.gsplat.direct import TILE
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
@@ -36,7 +36,7 @@ class GsplatStack(FieldStack):
         fields: float32, on any device. Later changes to them have no effect.
         device: that renders.
         antialiased: dim Gaussians that are smaller than a pixel.
-        direct: call gsplat's kernels directly, see `direct`; not with `antialiased`.
+        direct: call gsplat's kernels directly, see `GsplatRasterizer`; not with `antialiased`.
     """
 
     def __init__(
@@ -68,8 +68,8 @@ class GsplatStack(FieldStack):
             with torch.cuda.device(self._means.device):  # Triton launches on the current device
                 projected, colors = self._project_directly(cameras, viewmats, intrinsics, positions[0])
                 count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
-                offsets, flat = direct.sort_into_tiles(projected, size, len(cameras), of_image)
-                images, alphas, _ = direct.compiled_functions().rasterize_to_pixels_3dgs_fwd(
+                offsets, flat = bindings.sort_into_tiles(projected, size, len(cameras), of_image)
+                images, alphas, _ = bindings.compiled_functions().rasterize_to_pixels_3dgs_fwd(
                     *projected[1::2], colors, self._opacities[:count], None, None, *size, TILE, offsets, flat
                 )
         else:
@@ -100,7 +100,7 @@ class GsplatStack(FieldStack):
             if len(means) == 0:
                 continue  # gsplat divides by their number
             pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
-            projected = direct.project(means, quaternions, scales, opacities, pose, matrix, size)
+            projected = bindings.project(means, quaternions, scales, opacities, pose, matrix, size)
             stacked = radii, means2d, depths, conics, colors
             write_to_stack(means, position, sh, self._signed[i], projected, stacked, self._starts[i])
         return [radii, means2d, depths, conics], colors

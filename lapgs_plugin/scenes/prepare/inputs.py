@@ -17,7 +17,7 @@ from lapgs_plugin.scenes.images import check_image, has_alpha, image_size, requi
 from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_photos, write_mask
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import CONVERTED, camera_of, convert_photo, listed
+from lapgs_plugin.scenes.prepare.photos import camera_of, convert_photo, listed
 
 logger = logging.getLogger(__name__)
 
@@ -37,13 +37,14 @@ def make_photos(job: Job) -> None:
             write_frames(found.clip, numbers, partial, seen)
         logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
     else:
-        others = [name for name, source in found.files.items() if source.suffix.lower() in CONVERTED]
         for name, source in found.files.items():
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
             require_readable(source)
-            if name not in others:
+            if name not in found.converted:
                 shutil.copy2(source, partial / name)
-        job.each_photo("Converting photos", lambda name: convert_photo(found.files[name], partial / name), others)
+        job.each_photo(
+            "Converting photos", lambda name: convert_photo(found.files[name], partial / name), found.converted
+        )
     partial.rename(folder)
 
 
@@ -89,9 +90,9 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
     refused: dict[str, SceneError] = {}
 
     def size(name: str) -> tuple[int, int]:
-        photo = job.found.files.get(name, job.photos / name)  # errors name the user's file, not our copy
-        if photo.suffix.lower() in CONVERTED:
-            photo = job.photos / name
+        photo = job.photos / name
+        if name not in job.found.converted:
+            photo = job.found.files.get(name, photo)  # errors name the user's file, not our copy
         try:
             width, height = check_image(photo)
             share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from PIL import ExifTags, Image
@@ -12,7 +13,7 @@ from PIL import ExifTags, Image
 from lapgs_plugin.errors import SceneError, counted, first_line, printable, require_extra
 from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG
-from lapgs_plugin.scenes.masks import HEIC, SUFFIXES
+from lapgs_plugin.scenes.masks import HEIC, has_photo_suffix
 
 SHOWN = 10
 """File names in a message, at most."""
@@ -36,10 +37,15 @@ class Photos:
     files: dict[str, Path]
     clip: Path | None = None
 
+    @cached_property
+    def converted(self) -> tuple[str, ...]:
+        """Names of the photos that COLMAP does not read."""
+        return tuple(name for name, path in self.files.items() if _kind(path) in CONVERTED)
+
     @property
     def made(self) -> bool:
         """Whether COLMAP cannot read the files where they are."""
-        return self.clip is not None or any(path.suffix.lower() in CONVERTED for path in self.files.values())
+        return self.clip is not None or bool(self.converted)
 
 
 def find_photos(source: Path, masks: Path | None = None) -> Photos:
@@ -49,7 +55,7 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         SceneError: there are fewer than two photos, or two would have the same name after undistortion.
         MissingExtraError: there are HEIC photos, and pillow-heif is not installed.
     """
-    if source.is_file() and source.suffix.lower() in (*SUFFIXES, *HEIC):
+    if source.is_file() and has_photo_suffix(source):
         raise SceneError(
             f"{source}: one photo, expected a folder of at least 2, better 30, or a video; give the folder"
         )
@@ -65,12 +71,11 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         and not any(part.startswith(".") for part in file.relative_to(source).parts)
         and not (aside is not None and file.resolve().is_relative_to(aside))
     )
-    heic = [file for file in present if file.suffix.lower() in HEIC]
-    if heic:
-        what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed([file.name for file in heic])})"
+    chosen = [file for file in present if has_photo_suffix(file)]
+    if heic := [file.name for file in chosen if _kind(file) in HEIC]:
+        what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed(heic)})"
         require_extra("pillow_heif", "heic", what, "convert them to JPEG")
-    chosen = [file for file in present if file.suffix.lower() in (*SUFFIXES, *HEIC)]
-    others = sorted({file.suffix.lower() or file.name for file in present} - {*SUFFIXES, *HEIC})
+    others = sorted({file.suffix.lower() or file.name for file in present if not has_photo_suffix(file)})
     if len(chosen) < 2:
         found = f" (and files of type {', '.join(others)})" if others else ""
         raise SceneError(
@@ -84,11 +89,22 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     by_target: dict[str, Path] = {}
     for file in chosen:
         place = file.relative_to(source)
-        name = (place.with_suffix(".jpg") if file.suffix.lower() in CONVERTED else place).as_posix()
+        name = (place.with_suffix(".jpg") if _kind(file) in CONVERTED else place).as_posix()
         if (other := by_target.setdefault(target_name(name), place)) != place:
             raise SceneError(f"{source}: {other} and {place} would both become {target_name(name)}; rename one of them")
         files[name] = file
     return Photos(source, dict(sorted(files.items())))
+
+
+def _kind(photo: Path) -> str:
+    """Return the file type of a photo in lower case; phones and browsers name HEIC and WebP photos .jpg, too."""
+    with suppress(OSError), photo.open("rb") as stream:  # who reads the photo says why it cannot
+        start = stream.read(12)
+        if start[4:8] == b"ftyp":
+            return HEIC[0]
+        if start[:4] == b"RIFF" and start[8:] == b"WEBP":
+            return ".webp"
+    return photo.suffix.lower()
 
 
 def target_name(name: str) -> str:
@@ -109,7 +125,7 @@ def convert_photo(source: Path, target: Path) -> None:
     Raises:
         SceneError: it cannot be decoded, or is a WebP file with transparent pixels, which JPEG cannot keep.
     """
-    if source.suffix.lower() in HEIC:
+    if _kind(source) in HEIC:
         import pillow_heif
 
         pillow_heif.register_heif_opener()
@@ -138,3 +154,10 @@ def camera_of(photo: Path) -> tuple[str, ...]:
         values += [inner.get(tag) for tag in (tags.FocalLength, tags.FocalLengthIn35mmFilm)]
         return tuple("" if value is None else str(value).strip("\0 ") for value in values)
     return ("",) * 4
+
+
+def quarter_turns(photo: Path) -> int:
+    """Return the quarter turns clockwise that make a photo upright by EXIF; 0 where it does not tell, or mirrors."""
+    with suppress(Exception), Image.open(photo) as opened:  # as above
+        return {6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 1), 0)
+    return 0
