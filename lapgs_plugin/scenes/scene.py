@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from shlex import quote
 
 import numpy as np
 import torch
@@ -236,7 +237,9 @@ def _what_to_give(path: Path) -> str:
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
-    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
+    photos = next(
+        (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
+    )
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 

@@ -22,6 +22,7 @@ HUGE = "1000000000000000000"
         ("bench raster --sizes 1000000x1000000/5", "expected at most 8192x8192 pixels"),
         (f"bench raster --sizes 64x48/{HUGE}", "10000000 Gaussians"),
         (f"bench raster --sizes {HUGE}{HUGE}x1/1", "expected one of"),
+        ("bench ops --width 2", "--width 2: expected at least 3"),
         (f"bench raster --repeats {HUGE}", f"--repeats {HUGE}: expected at most 1000"),
         ("bench raster --repeats inf", "--repeats inf: expected a valid integer"),
         ("bench raster --json folder", "--json folder: expected a file in a folder that exists"),
