@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,6 @@ HOLD_OUT_EVERY = 8
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
-
-UNDISTORT_HINT = (
-    "only pinhole images can be trained on; `lapgs prepare PHOTOS OUT` undistorts photos, as does COLMAP's "
-    "image_undistorter"
-)
 
 LARGEST = 1e12
 """Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
@@ -64,6 +60,14 @@ class SceneSource:
     test: tuple[Frame, ...]
     points: NDArray[np.float64]  # (n, 3)
     colors: NDArray[np.float64]  # (n, 3)
+
+
+def undistort_hint(photos: Path) -> str:
+    """Return what to do about distorted photos in a folder."""
+    return (
+        f"only pinhole images can be trained on; `lapgs prepare {quote(str(photos))} OUT` undistorts photos, as does "
+        "COLMAP's image_undistorter"
+    )
 
 
 def check_camera(who: str, camera: Camera) -> None:
