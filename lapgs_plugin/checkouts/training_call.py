@@ -102,11 +102,6 @@ class TrainingCall:
         return next((iterations for name, iterations in lists if name.startswith("test")), ())
 
     @property
-    def iteration_lists(self) -> dict[str, Sequence[int]]:
-        """Arguments that list iterations, such as those to save after."""
-        return dict(_iteration_lists(self.values))
-
-    @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
 
@@ -130,7 +125,7 @@ class TrainingCall:
 
     def listing(self, change: Callable[[Sequence[int]], list[int]]) -> TrainingCall:
         """Return the call with other lists of iterations: arguments, and parsed options among the arguments."""
-        lists: dict[str, Any] = {name: change(iterations) for name, iterations in self.iteration_lists.items()}
+        lists: dict[str, Any] = {name: change(iterations) for name, iterations in _iteration_lists(self.values)}
         for name, value in self.values.items():
             if isinstance(value, Namespace):
                 lists[name] = Namespace(**{**vars(value), **{n: change(i) for n, i in _iteration_lists(vars(value))}})

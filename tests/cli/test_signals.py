@@ -251,13 +251,13 @@ press = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM) or t
 with interrupt.command():
     press()  # ctypes cannot pass on what is raised in a callback
     time.sleep(30)
+    print("nothing was raised")
 """
 
 
 def test_an_interruption_that_a_callback_loses_is_raised_again() -> None:
-    begin = time.monotonic()
     done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, check=False)
-    assert time.monotonic() - begin < 25
+    assert done.stdout == ""
     assert done.returncode == 143
     assert done.stderr == "lapgs: stopped by SIGTERM\n"
 

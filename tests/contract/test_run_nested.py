@@ -369,7 +369,7 @@ def test_tamings_budget_is_the_whole_runs(run_of: Callable[[str], tuple[RunArchi
 
 def test_three_levels(tmp_path: Path) -> None:
     make_sample_scene(tmp_path / "big", width=96, height=66, views=12, points=300, progress=False)
-    archive, _ = run_hierarchy(STUBS["fastgs"], tmp_path / "big", tmp_path / "run", "--iterations", 60, levels=3)
+    archive, _ = run_hierarchy(STUBS["fastgs"], tmp_path / "big", tmp_path / "run", "--iterations", 12, levels=3)
     assert [(r.level, r.signed) for r in archive.manifest.records] == [(2, False), (1, False), (0, False)]
 
 

@@ -24,6 +24,8 @@ from random import Random
 from types import TracebackType
 from typing import Any
 
+from tests.fuzz.worker import STOPPED
+
 MOST_BYTES = 1_500_000_000
 """Of the whole process, torch and all."""
 MOST_SECONDS = 60.0
@@ -32,9 +34,6 @@ MOST_MORE = 4_000_000_000
 START_SECONDS = 300.0
 LONGEST_LINE = 1_500
 """Characters of a message: one that quotes a whole file is no line."""
-STOPPED = 130
-"""Exit code of a training that `worker` ended: everything that was read was good."""
-
 ROOT = Path(__file__).parents[2]
 Damage = Callable[[bytes, Random], bytes]
 
@@ -283,7 +282,7 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
     Args:
         folder: nothing outside of it changes.
         steps: an action, the path it is about, and for "move" another name, for "copy" another path. Those whose
-            paths a former step removed are left out.
+            paths a former step removed or whose other name a folder has are left out.
     """
     for action, name, *other in steps:
         path = folder / name
@@ -296,7 +295,8 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
             target.write_bytes(path.read_bytes())
             continue
         if action == "move":
-            path.rename(path.with_name(target.name))
+            if not path.with_name(target.name).is_dir():
+                path.rename(path.with_name(target.name))
             continue
         if path.is_dir():
             shutil.rmtree(path)

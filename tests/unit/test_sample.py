@@ -316,6 +316,7 @@ def test_blocks_of_an_image_miss_no_solid() -> None:
         ({"views": 1}, "--views 1: expected 2 to 9999"),
         ({"points": 0}, "--points 0: expected at least 1"),
         ({"width": 8}, "--size 8x32: expected at least 16x16"),
+        ({"width": 99_999}, "--size 99999x32: expected at most 8192x8192"),
         ({"seed": -1}, "--seed -1: expected 0 or more"),
     ],
 )
