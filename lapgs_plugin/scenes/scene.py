@@ -232,8 +232,9 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _what_to_give(path: Path) -> str:
-    """Return the advice for a folder that is no scene: the scene or the photos in it."""
-    folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
+    inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's

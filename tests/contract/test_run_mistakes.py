@@ -309,10 +309,11 @@ def test_a_folder_of_the_backbone_itself_is_not_written_over(scene: Path, tmp_pa
 
 
 def test_files_that_the_script_has_just_written_are_no_others(copy: Path, scene: Path, tmp_path: Path) -> None:
-    """As of forks whose main blocks save their arguments before they train."""
+    """As of forks whose main blocks save their arguments before they train, and take what training returns."""
     script, folder = copy / "graphdeco" / "train.py", tmp_path / "run"
     call = "    training(\n        lp.extract(args)"
-    edit(script, call, f"    os.makedirs(args.model_path + '/log/args', exist_ok=True)\n{call}")
+    edit(script, call, f"    os.makedirs(args.model_path + '/log/args', exist_ok=True)\n    taken, = {call.lstrip()}")
+    edit(script, "\n\n\ndef prepare_output_and_logger", "\n    return [iteration]\n\n\ndef prepare_output_and_logger")
 
     def run() -> None:
         with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, "--iterations", 4, script=script) as own:

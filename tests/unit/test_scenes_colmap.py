@@ -368,6 +368,13 @@ def test_a_folder_around_a_scene_is_told_where_it_is(tmp_path: Path, name: str) 
         load(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["images", "sparse", "sparse/0"])
+def test_a_folder_in_a_scene_is_told_which_it_is(tmp_path: Path, name: str) -> None:
+    path = make_scene(tmp_path / "garden")
+    with pytest.raises(SceneError, match=rf"garden/{name}: neither .* in it; give \S+/garden, which has one"):
+        load(path / name)
+
+
 def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
     write_images(tmp_path, {"one.png": (8, 8), "keyframes/images/1.png": (8, 8)})
     with pytest.raises(SceneError, match=r"make a scene from photos with `lapgs prepare \S+/keyframes/images OUT`"):
