@@ -106,7 +106,7 @@ def test_points_are_off_the_surface_by_the_noise_that_is_promised(
 ) -> None:
     off = np.array([model.points3D[key].xyz - surface_points[key] for key in model.points3D])
     # 1500 normal numbers: their deviation is known to 1.8 %, their mean to 2.6 % of it; four times that.
-    np.testing.assert_allclose(off.std(), NOISE, rtol=0.075)
+    np.testing.assert_allclose(off.std(), NOISE, rtol=0.075)  # 0.016 seen
     np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.18 * NOISE)
 
 
