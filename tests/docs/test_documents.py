@@ -23,8 +23,8 @@ OF_OTHERS = {
     "--depth_loss",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
     "--highfeature_lr", "--ho_iteration", "--kernel_size", "--loss_thresh", "--max_n_gaussian", "--mult",
-    "--opacity_reset_interval", "--optimizer_type",
-    "--position_lr_max_steps", "--prune_iterations", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
+    "--opacity_reset_interval", "--optimizer_type", "--prune_iterations",
+    "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
     "--test_iterations",
     # of the authors' release
     "--iter_plan",
