@@ -117,9 +117,11 @@ class Profile:
         if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
             found.append((rasterizer.module, name))
         holder = self._holder(use)
-        if holder is not None and name in vars(holder) and (holder, name) not in found:  # something that wraps it
-            found.append((holder, name))
-        return found
+        if holder is None or name not in vars(holder) or (holder, name) in found:
+            return found
+        # Something that wraps it, unless another rasterizer has the same name and this one is imported in a function.
+        others = [vars(each.module).get(name) for each in self.rasterizers if each.module is not rasterizer.module]
+        return found if any(vars(holder)[name] is other for other in others) else [*found, (holder, name)]
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
         """Return a model, made with the arguments that the script gives.

@@ -159,7 +159,7 @@ class ActiveStage:
             LapgsError: training left nothing to archive.
         """
         self.begin()
-        self._call.run()
+        self._context.returned = self._call.run()
         self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 

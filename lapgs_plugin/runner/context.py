@@ -38,6 +38,7 @@ class RunContext:
 
     Attributes:
         stage: the running stage, or that of the dry run, which answers the replaced symbols; None between stages.
+        returned: what the script's last call of `training` returned, for its main block.
     """
 
     adapter: BackboneAdapter
@@ -50,6 +51,7 @@ class RunContext:
     watcher: Watcher
     measuring: MeasuringOptions
     stage: Any = None
+    returned: Any = None
     _told: set[str] = field(default_factory=set)
 
     def warn_of_other_images(self, problem: str) -> None:

@@ -92,7 +92,7 @@ class SingleCall:
             if self._done:
                 self._run_from(stage.window.start)
             else:
-                self._call.run()
+                self._context.returned = self._call.run()
             level, done = self._stage.stage.level, self._stage.window.start + self._stage.iteration
             self._stage.require_trained(done, self._plan.iterations, ended=level == 0)
             self._stage.finish()
@@ -173,4 +173,4 @@ class SingleCall:
         with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment(keeping):
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
-            self._call.changed(**dict.fromkeys(takes, str(path))).run()
+            self._context.returned = self._call.changed(**dict.fromkeys(takes, str(path))).run()

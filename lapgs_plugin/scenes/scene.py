@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from shlex import quote
 
 import numpy as np
 import torch
@@ -231,12 +232,15 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _what_to_give(path: Path) -> str:
-    """Return the advice for a folder that is no scene: the scene or the photos in it."""
-    folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
+    inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
-    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
+    photos = next(
+        (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
+    )
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 

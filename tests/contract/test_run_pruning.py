@@ -17,13 +17,22 @@ from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runner import stage_pruning
 from lapgs_plugin.runner.active_stage import ActiveStage
-from tests.contract.stub_runs import KINDS, NAMES, STUBS, THIRDS, captured, drive, loaded, run_hierarchy, run_residuals
+from tests.contract.stub_runs import (
+    NAMES,
+    STUBS,
+    STUBS_AND_KINDS,
+    THIRDS,
+    captured,
+    drive,
+    loaded,
+    run_hierarchy,
+    run_residuals,
+)
 
 SHARE = 0.05
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "hierarchy"), STUBS_AND_KINDS)
 def test_what_is_least_seen_goes(
     name: str, hierarchy: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
