@@ -53,7 +53,10 @@ def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
     if isinstance(dc := inputs.get("dc"), Tensor) and isinstance(rest := inputs.get("shs"), Tensor):
         inputs["shs"] = torch.cat([dc, rest], dim=1)
     for what, name, values in archived:
-        if not any(_alike(inputs.get(name), value) for value in values):
+        given = [inputs.get(name)]
+        if what == "opacities" and isinstance(given[0], Tensor):
+            given.append(given[0].clamp(max=1))  # as those above 1 are archived, of which a warning tells
+        if not any(_alike(each, value) for each in given for value in values):
             yield what
 
 

@@ -23,6 +23,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a scene for three levels, with odd sizes at the second."""
+    path = tmp_path_factory.mktemp("big") / "scene"
+    make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
+    return path
+
+
+@pytest.fixture(scope="session")
 def bare_run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Result, Tensor]]:
     """Return a function that runs a stub once as Python does, and the random number that comes after its run."""
 

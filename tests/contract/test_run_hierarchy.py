@@ -19,7 +19,6 @@ from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
@@ -97,14 +96,6 @@ class Recorder(StageHook):
 
     def loss(self, context: StageContext, image: Tensor) -> None:
         self.contexts.setdefault(context.stage.level, []).append((context, image.detach().clone()))
-
-
-@pytest.fixture(scope="module")
-def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a scene for three levels with odd sizes at the second."""
-    path = tmp_path_factory.mktemp("big") / "scene"
-    make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
-    return path
 
 
 @pytest.fixture(scope="module")

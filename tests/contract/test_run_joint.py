@@ -24,7 +24,6 @@ from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
@@ -130,14 +129,6 @@ def test_finished_fields_follow_optimizers_that_a_loop_makes_in_the_middle(
     assert len(steps) == 9, "in iterations 11 to 19; after its last the checkout does not step"
 
 
-@pytest.fixture(scope="module")
-def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a scene for three levels with odd sizes at the second."""
-    path = tmp_path_factory.mktemp("odd") / "scene"
-    make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
-    return path
-
-
 class Inspected:
     """Inspect joint levels when they begin to follow a stage, in place of `JointLevels.follow`."""
 
@@ -152,7 +143,7 @@ class Inspected:
         monkeypatch.setattr(JointLevels, "follow", follow)
 
 
-def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_predictions_are_up_of_the_archived_levels(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Predictions before the first joint step are those of the archived fields, rendered without the checkout's code.
 
     The cached predictions are dropped by then.
@@ -164,7 +155,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
         assert len(kept.store) == 0
         renderer = run_renderer(RunArchive.open(tmp_path / "run"), device="cpu", rasterizer="cpu")
         found = []
-        for view in load_scene(odd, progress=False).train[:3]:
+        for view in load_scene(big, progress=False).train[:3]:
             (key,) = [key for key in levels._views.cameras if Path(view_name(key)).stem == Path(view.name).stem]
             image = levels.get(key)
             level = min(renderer.fields)
@@ -176,14 +167,14 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
         return found
 
     inspected = Inspected(monkeypatch, differences)
-    run_residuals(STUBS["graphdeco"], odd, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
+    run_residuals(STUBS["graphdeco"], big, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
     assert [len(found) for found in inspected.results] == [3, 3], "two residual stages"
     assert max(max(found) for found in inspected.results) < 5e-6  # 1.8e-7 seen
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_every_finished_field(
-    name: str, odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gradients by colour of a weighted sum of the composed image, linear in colours, equal differences."""
 
@@ -208,7 +199,7 @@ def test_gradients_reach_every_finished_field(
 
     inspected = Inspected(monkeypatch, relative_errors)
     options = ("--iterations", 60) if name == "taming" else ("--iterations", 12)
-    run_residuals(STUBS[name], odd, tmp_path / "run", *options, levels=3, joint=0.5)
+    run_residuals(STUBS[name], big, tmp_path / "run", *options, levels=3, joint=0.5)
     assert [len(errors) for errors in inspected.results] == [1, 2]
     assert max(max(errors) for errors in inspected.results) < 2e-3  # 1.9e-4 seen: dark colours of the base are clamped
 
@@ -310,11 +301,11 @@ def two_finished(scene: Path, folder: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_run_killed_while_it_archives_them_ends_as_others(
-    odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run is killed at any write after the last stage, and resumed."""
-    whole = three_levels(odd, tmp_path / "whole", resume=False)
-    begun = two_finished(odd, tmp_path / "begun")
+    whole = three_levels(big, tmp_path / "whole", resume=False)
+    begun = two_finished(big, tmp_path / "begun")
     base = plys(RunArchive.open(begun))
     assert all(before != after for before, after in zip(base, plys(whole)[:2], strict=True)), "they were trained along"
     writes = FailingWrites(monkeypatch, Killed)
@@ -322,20 +313,20 @@ def test_a_run_killed_while_it_archives_them_ends_as_others(
     while not done:
         folder = shutil.copytree(begun, tmp_path / str(left))
         with contextlib.suppress(Killed), captured(folder, []):
-            three_levels(odd, folder, FailAfterStage(writes, 0, left))
+            three_levels(big, folder, FailAfterStage(writes, 0, left))
             done = True
         writes.left = sys.maxsize
         killed = RunArchive.open(folder)
         assert plys(killed) == (plys(whole) if killed.manifest.complete else base)
-        assert plys(three_levels(odd, folder)) == plys(whole)
+        assert plys(three_levels(big, folder)) == plys(whole)
         assert {path.name for path in folder.glob("level_*/*.ply")} == {"input.ply", "point_cloud.ply"}
         left += 1
     # The manifest is written again when the held-out views are measured.
     assert left == 18, "three PLYs and two manifests in three steps each, two renamings, and a run that went well"
 
 
-def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = two_finished(odd, tmp_path / "run")
+def test_nan_in_one_of_them_leaves_all_as_they_were(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = two_finished(big, tmp_path / "run")
     before = plys(RunArchive.open(folder))
     original = JointLevels.fields
 
@@ -346,7 +337,7 @@ def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, m
 
     monkeypatch.setattr(JointLevels, "fields", poisoned)
     with captured(folder, []), pytest.raises(FieldError, match="level 1: x is NaN or inf for 1 of"):
-        three_levels(odd, folder)
+        three_levels(big, folder)
     assert plys(RunArchive.open(folder)) == before
 
 

@@ -23,7 +23,7 @@ OF_OTHERS = {
     "--depth_loss",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--disable_viewer", "--grad_abs_thresh",
     "--highfeature_lr", "--ho_iteration", "--kernel_size", "--loss_thresh", "--max_n_gaussian", "--mult",
-    "--opacity_reset_interval", "--optimizer_type",
+    "--opacity_reset_interval", "--optimizer_type", "--prune_iterations",
     "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
     "--test_iterations",
     # of the authors' release
