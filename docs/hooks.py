@@ -110,7 +110,7 @@ def _command_section(words: tuple[str, ...], command: Any) -> Iterator[str]:
     for each in command.get_params(context):
         names, text = each.get_help_record(context)
         title = getattr(each, "rich_help_panel", None) or ("Options" if names.startswith("-") else "Arguments")
-        row = f"| `{names.removesuffix(' <bool>')}` | {_escaped(' '.join(text.split()))} |"
+        row = f"| `{names.strip()}` | {_escaped(' '.join(text.split()))} |"
         panels.setdefault(title, []).append(row)
     for title, rows in panels.items():
         yield from ("", f"| {title} | |", "|---|---|", *rows)

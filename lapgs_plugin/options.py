@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any
@@ -110,10 +109,14 @@ def check_values(settings: Any) -> None:
             raise UserInputError(f"{name} {value}: expected at most {declared.most:g}")
 
 
+LARGEST = 1e30
+"""Largest factor or rate that is accepted; kernels compute in float32."""
+
+
 def require_positive(name: str, value: float, kind: str) -> None:
-    """Raise a UserInputError about a number that is not positive and finite."""
-    if not (value > 0.0 and math.isfinite(value)):
-        raise UserInputError(f"{name} {value}: expected a positive {kind}")
+    """Raise a UserInputError about a number that is not positive and finite in float32."""
+    if not 0.0 < value <= LARGEST:
+        raise UserInputError(f"{name} {value}: expected a positive {kind} of at most {LARGEST:g}")
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:

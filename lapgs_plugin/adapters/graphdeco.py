@@ -51,9 +51,11 @@ class Adapter(BackboneAdapter):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         """Return whether a folder has the files of a checkout whose calls fit graphdeco's own rasterizers."""
-        source = readable_source(folder) if cls.info.recognises(folder) else None
+        if not cls.info.recognises(folder):
+            return False
+        source = readable_source(folder)
         if source is None or cls.info.own_files:
-            return cls.info.recognises(folder)
+            return True
         return all(
             use.module == cls.info.rasterizer and not use.settings - SETTINGS and not use.inputs & OTHER_INPUTS
             for use in source.rasterizers

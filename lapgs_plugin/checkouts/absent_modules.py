@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Mapping
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,8 +23,6 @@ from torch import Tensor
 from lapgs_plugin.errors import MissingExtraError
 
 __all__ = ["NoLog", "absent_modules"]
-
-Item = TypeVar("Item")
 
 
 def absent_modules(logs: bool = False) -> dict[str, ModuleType]:
@@ -100,34 +98,6 @@ def _described(value: object) -> str:
     )
 
 
-class _Progress(Generic[Item]):
-    """Print progress in one line of the terminal, with the methods of `tqdm.tqdm` that training loops call."""
-
-    def __init__(self, iterable: Iterable[Item] = (), desc: str = "", **_: object) -> None:
-        self._items = iterable
-        self._total = len(iterable) if isinstance(iterable, Sized) else None
-        self._label, self._done, self._postfix, self._closed = desc or "Progress", 0, "", False
-
-    def __iter__(self) -> Iterator[Item]:
-        for item in self._items:
-            yield item
-            self.update()
-        self.close()
-
-    def set_postfix(self, values: Mapping[str, object]) -> None:
-        self._postfix = ", ".join(f"{key}={value}" for key, value in values.items())
-
-    def update(self, steps: int = 1) -> None:
-        self._done += steps
-        of = "" if self._total is None else f"/{self._total}"
-        print(f"\r{self._label}: {self._done}{of} {self._postfix}", end="", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        if not self._closed:
-            print(file=sys.stderr)
-        self._closed = True
-
-
 def _dump(value: object, path: str) -> None:
     """Pickle a value to a file, which joblib can read."""
     Path(path).write_bytes(pickle.dumps(value))
@@ -159,7 +129,6 @@ _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
     "cv2": ("opencv-python-headless", {"cv2": {}}),
     # The viewers of FastGS and Taming-3DGS use it; they are off by default.
     "websockets": ("websockets", {"websockets": {}}),
-    "tqdm": ("tqdm", {"tqdm": {"tqdm": _Progress}}),
     # Mip-Splatting imports it without using it.
     "open3d": ("open3d", {"open3d": {}}),
     # 2DGS draws curves and depths with it.

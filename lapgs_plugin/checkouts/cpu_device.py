@@ -10,6 +10,7 @@ tensors say that they are on "cpu".
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -31,7 +32,8 @@ __all__ = ["cuda_on_cpu"]
 def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[None]:
     """Let a checkout run without CUDA inside a `with` block, and restore everything at its end.
 
-    Symbols are replaced in the whole process; devices in calls of torch functions are redirected in this thread only.
+    Symbols are replaced in the whole process; devices in calls of torch functions are redirected in this thread and in
+    those that are started inside.
 
     Args:
         variant: stand-in for the checkout's rasterizer, a key of `standins.VARIANTS`; None for a script without one.
@@ -51,6 +53,7 @@ def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[No
         stack.enter_context(_replaced(vars(torch), {"load": _loading_to_cpu(torch.load)}))
         mode = _CudaMeansCpu()
         stack.enter_context(_replaced(vars(torch.autograd), _engine_within(mode)))
+        stack.enter_context(_threads_within(mode))
         stack.enter_context(mode)
         yield
 
@@ -97,6 +100,23 @@ def _engine_within(mode: _CudaMeansCpu) -> dict[str, Callable[..., Any]]:
             return run_backward(*args, **kwargs)
 
     return {"_engine_run_backward": running}
+
+
+@contextmanager
+def _threads_within(mode: _CudaMeansCpu) -> Iterator[None]:
+    """Let threads that are started inside run with the mode, which torch keeps for each thread."""
+    run = threading.Thread.run
+
+    @wraps(run)
+    def running(thread: threading.Thread) -> None:
+        with mode:
+            run(thread)
+
+    threading.Thread.run = running  # type: ignore[method-assign,assignment]
+    try:
+        yield
+    finally:
+        threading.Thread.run = run  # type: ignore[method-assign]
 
 
 def _cuda(tensor: Tensor, device: object = None, non_blocking: bool = False, **layout: Any) -> Tensor:

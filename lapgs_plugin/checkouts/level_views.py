@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import random
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, wraps
@@ -80,7 +81,8 @@ class SceneImages:
 
     def __init__(self) -> None:
         self._images: dict[str, FullSizeImage] = {}
-        self._making = False
+        # Some checkouts make their cameras in several threads.
+        self._making, self._lock = threading.local(), threading.Lock()
         self.masks: dict[str, Tensor] = {}
 
     def adopting(self, original: Callable[..., None]) -> Callable[..., None]:
@@ -92,12 +94,12 @@ class SceneImages:
             bound = signature.bind(camera, *args, **kwargs)
             if "data_device" in signature.parameters:
                 bound.arguments["data_device"] = "cpu"  # avoids a copy of the image to the GPU and back
-            outermost = not self._making
-            self._making = True
+            outermost = not getattr(self._making, "now", False)
+            self._making.now = True
             try:
                 original(*bound.args, **bound.kwargs)
             finally:
-                self._making = not outermost
+                self._making.now = not outermost
             if outermost:  # a derived class calls this one before it is ready
                 self._adopt(camera)
 
@@ -111,8 +113,10 @@ class SceneImages:
                 f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
                 "scene's images as RGB"
             )
-        key = f"{len(self._images):05d}-{camera.image_name}"
-        self._images[key] = FullSizeImage.of(image)
+        stored = FullSizeImage.of(image)
+        with self._lock:
+            key = f"{len(self._images):05d}-{camera.image_name}"
+            self._images[key] = stored
         del camera.original_image
         setattr(camera, KEY, key)
 

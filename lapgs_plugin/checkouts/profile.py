@@ -10,6 +10,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from types import FunctionType, ModuleType
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource
+from lapgs_plugin.checkouts.syntax import plain_assignments
 from lapgs_plugin.errors import UserInputError
 
 SCENE_ROLES = ("getTrainCameras", "getTestCameras")
@@ -115,9 +117,11 @@ class Profile:
         if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
             found.append((rasterizer.module, name))
         holder = self._holder(use)
-        if holder is not None and name in vars(holder) and (holder, name) not in found:  # something that wraps it
-            found.append((holder, name))
-        return found
+        if holder is None or name not in vars(holder) or (holder, name) in found:
+            return found
+        # Something that wraps it, unless another rasterizer has the same name and this one is imported in a function.
+        others = [vars(each.module).get(name) for each in self.rasterizers if each.module is not rasterizer.module]
+        return found if any(vars(holder)[name] is other for other in others) else [*found, (holder, name)]
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
         """Return a model, made with the arguments that the script gives.
@@ -301,7 +305,19 @@ class Profile:
 
     def _evaluated(self, expression: ast.expr, values: Mapping[str, Any]) -> Any:
         code = compile(ast.Expression(expression), str(self.script.path), "eval", dont_inherit=True)
-        return eval(code, vars(self.script.module), dict(values))
+        try:
+            return eval(code, vars(self.script.module), dict(values))
+        except NameError:
+            return eval(code, vars(self.script.module), self._with_locals(values))
+
+    def _with_locals(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return arguments of the training function with the local variables that it sets plainly before its loop."""
+        names = dict(values)
+        for statement in plain_assignments(self.source.training):
+            code = compile(ast.Module([statement], []), str(self.script.path), "exec", dont_inherit=True)
+            with suppress(Exception):  # it needs something that exists in the loop only
+                exec(code, vars(self.script.module), names)
+        return names
 
 
 def held_by(module: ModuleType) -> list[tuple[str, Any]]:

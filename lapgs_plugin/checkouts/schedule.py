@@ -12,7 +12,7 @@ import builtins
 import copy
 import inspect
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, cast
@@ -81,6 +81,11 @@ class Operand:
         return self.operator in (ast.In, ast.NotIn)
 
     @property
+    def is_event_list(self) -> bool:
+        """Whether it is an option that lists iterations for an event, not for a report or a checkpoint."""
+        return self.is_list and HARMFUL.search(self.name) is not None
+
+    @property
     def is_bound(self) -> bool:
         """Whether it is an iteration at which something begins, ends or happens."""
         return not self.periodic and not self.is_list
@@ -95,8 +100,10 @@ class Operand:
     def value(self, variables: Mapping[str, Any]) -> Any:
         """Return its value, None if that is known inside of the loop only."""
         if self.option is not None:
-            found = variables.get(self.option[0])
-            return getattr(found, self.option[1], None) if self.option[1] else found
+            found, name = variables.get(self.option[0]), self.option[1]
+            if isinstance(found, Mapping) and name:
+                return found.get(name)
+            return getattr(found, name, None) if name else found
         try:
             return ast.literal_eval(self.node)
         except ValueError:
@@ -233,8 +240,9 @@ class Schedule:
     ) -> StageSchedule:
         """Return what changes in a stage of its own length.
 
-        Late bounds keep their share of the iterations; so does the period of rare events between such bounds. Where a
-        rare event of `HARMFUL` functions would fall into the last tenth of the stage, it comes at that tenth's start.
+        Late bounds, and lists such as `--prune_iterations`, keep their share of the iterations; so does the period of
+        rare events between such bounds. Where a rare event of `HARMFUL` functions would fall into the last tenth of the
+        stage, it comes at that tenth's start.
 
         Args:
             whole: variables that the function sees in the whole run, by name: its arguments and globals.
@@ -247,6 +255,9 @@ class Schedule:
         keep = {*keep, *KEPT, *periods}
         late = window.total / RARE
         for event in self.events:
+            for operand in event.operands:
+                if operand.is_event_list and operand.name not in keep and (given := operand.value(whole)):
+                    changed.set_list(operand, given, [window.scaled(i) if i > late else i for i in given])
             found = [*(each for each in event.operands if each.is_bound), *event.listed]
             bounds = [(each, number) for each in found if (number := each.number(whole) or 0) > late]
             for bound, number in bounds:
@@ -274,7 +285,7 @@ class StageSchedule:
 
     _function: ast.FunctionDef
     _variable: str  # of its loop
-    options: dict[tuple[str, str], int] = field(default_factory=dict)
+    options: dict[tuple[str, str], Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     _numbers: dict[Place, int] = field(default_factory=dict)
     _moved: dict[Place, int] = field(default_factory=dict)
@@ -289,12 +300,19 @@ class StageSchedule:
             self.options[operand.option] = after
         self.notes.append(f"{operand.text if operand.option else before} -> {after}")
 
+    def set_list(self, operand: Operand, before: Sequence[int], after: list[int]) -> None:
+        """Give an option that lists iterations other ones, whatever the adapter has made of it."""
+        assert operand.option is not None, "as it has a name"
+        if operand.option not in self.options and after != list(before):
+            self.notes.append(f"{operand.text} -> {after}")
+        self.options[operand.option] = after
+
     def keep_clear(self, event: Event, variables: Mapping[str, Any], end: int) -> None:
         """Move an event out of the last tenth of a stage that ends at iteration `end`."""
 
         def now(operand: Operand) -> int | None:
             if operand.option in self.options:
-                return self.options[operand.option]
+                return int(self.options[operand.option])
             return self._numbers.get(_place(operand.node), operand.number(variables))
 
         assert event.period is not None
@@ -314,7 +332,10 @@ class StageSchedule:
                 continue
             if result[variable] is values[variable]:
                 result[variable] = copy.copy(values[variable])
-            setattr(result[variable], attribute, value)
+            if isinstance(result[variable], dict):
+                result[variable][attribute] = value
+            else:
+                setattr(result[variable], attribute, value)
         return result
 
     def function(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -324,7 +345,11 @@ class StageSchedule:
             original: the function of the tree, whose globals are used.
         """
         arguments = {each.arg for each in ast.walk(self._function.args) if isinstance(each, ast.arg)}
-        elsewhere = {option: value for option, value in self.options.items() if option[0] not in arguments}
+        elsewhere = {
+            option: tuple(value) if isinstance(value, list) else value
+            for option, value in self.options.items()
+            if option[0] not in arguments
+        }
         if not (self._numbers or self._moved or elsewhere):
             return original
         rewriter = _Rewriter(self._numbers, self._moved, elsewhere, self._variable)
@@ -345,7 +370,7 @@ class _Rewriter(ast.NodeTransformer):
 
     numbers: Mapping[Place, Any]
     moved: Mapping[Place, int] = field(default_factory=dict)
-    options: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    options: Mapping[tuple[str, str], Any] = field(default_factory=dict)
     variable: str = ""
 
     def visit(self, node: ast.AST) -> Any:
@@ -368,11 +393,12 @@ class _Rewriter(ast.NodeTransformer):
 
 
 def _option(node: ast.expr) -> tuple[str, str] | None:
-    """Return (variable, attribute) of an option such as `opt.iterations`; the attribute of a variable is empty."""
+    """Return (variable, name) of `opt.iterations` or `opt["iterations"]`; the name of a variable itself is empty."""
     if isinstance(node, ast.Name):
         return node.id, ""
-    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-        return node.value.id, node.attr
+    if isinstance(node, (ast.Attribute, ast.Subscript)) and isinstance(node.value, ast.Name):
+        name = node.attr if isinstance(node, ast.Attribute) else getattr(node.slice, "value", None)
+        return (node.value.id, name) if isinstance(name, str) else None
     return None
 
 

@@ -45,6 +45,32 @@ def executed_on_import(body: Iterable[ast.AST], *, surely: bool = False) -> Iter
                 yield from executed_on_import(getattr(node, part, []), surely=surely)
 
 
+def plain_assignments(function: ast.FunctionDef) -> list[ast.stmt]:
+    """Return the statements of a function's body that set local variables to values without calling anything.
+
+    Variables that other statements set too, such as those of a loop, are left out.
+    """
+    plain = [node for node in function.body if _only_assigns(node)]
+    others = {name for node in function.body if node not in plain for name in _stored(node)}
+    return [node for node in plain if not _stored(node) & others]
+
+
+def _only_assigns(node: ast.stmt) -> bool:
+    nodes = list(ast.walk(node))
+    kept = (ast.Assign, ast.AnnAssign, ast.If, ast.Pass)
+    acts = any(isinstance(each, (ast.Call, ast.Await, ast.Yield, ast.YieldFrom)) for each in nodes)
+    targets = [each for each in nodes if isinstance(getattr(each, "ctx", None), ast.Store)]
+    return (
+        not acts
+        and all(isinstance(each, kept) for each in nodes if isinstance(each, ast.stmt))
+        and all(isinstance(each, (ast.Name, ast.Tuple)) for each in targets)
+    )
+
+
+def _stored(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
+
+
 def place(path: Path, root: Path, line: int) -> str:
     """Return a line of a file as `file:line`, relative to the checkout's root if the file is below it."""
     return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"

@@ -102,11 +102,6 @@ class TrainingCall:
         return next((iterations for name, iterations in lists if name.startswith("test")), ())
 
     @property
-    def iteration_lists(self) -> dict[str, Sequence[int]]:
-        """Arguments that list iterations, such as those to save after."""
-        return dict(_iteration_lists(self.values))
-
-    @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
 
@@ -130,16 +125,16 @@ class TrainingCall:
 
     def listing(self, change: Callable[[Sequence[int]], list[int]]) -> TrainingCall:
         """Return the call with other lists of iterations: arguments, and parsed options among the arguments."""
-        lists: dict[str, Any] = {name: change(iterations) for name, iterations in self.iteration_lists.items()}
+        lists: dict[str, Any] = {name: change(iterations) for name, iterations in _iteration_lists(self.values)}
         for name, value in self.values.items():
             if isinstance(value, Namespace):
                 lists[name] = Namespace(**{**vars(value), **{n: change(i) for n, i in _iteration_lists(vars(value))}})
         return replace(self, values={**self.values, **lists})
 
-    def run(self) -> None:
-        """Make the call."""
+    def run(self) -> Any:
+        """Make the call and return its result."""
         with self.own_folder():
-            self.function(**self.values)
+            return self.function(**self.values)
 
     @contextmanager
     def own_folder(self) -> Iterator[None]:

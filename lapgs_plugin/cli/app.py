@@ -33,6 +33,10 @@ from lapgs_plugin.errors import LapgsError
 class Commands(TyperGroup):
     """Run a command so that signals end it as `lapgs_plugin.interrupt` says and usage errors are one line."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        _show_flags_without_type(self)
+
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         with one_line_usage_errors():
             return super().make_context(*args, **kwargs)
@@ -40,6 +44,15 @@ class Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with interrupt.command(), one_line_usage_errors(ctx):
             return super().invoke(ctx)
+
+
+def _show_flags_without_type(command: Any) -> None:
+    """Leave out `<bool>` behind flags in help texts: it reads as if a value had to follow."""
+    for each in command.get_params(typer.Context(command)):
+        if getattr(each, "is_flag", False):
+            each.metavar = ""
+    for below in getattr(command, "commands", {}).values():
+        _show_flags_without_type(below)
 
 
 app = typer.Typer(

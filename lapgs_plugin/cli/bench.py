@@ -51,8 +51,8 @@ def experiment(
 
 
 def ops(
-    width: Annotated[int, typer.Option(min=2, max=16384, help="Width of the images in pixels.")] = 800,
-    height: Annotated[int, typer.Option(min=2, max=16384, help="Height of the images in pixels.")] = 532,
+    width: Annotated[int, typer.Option(min=3, max=16384, help="Width of the images in pixels.")] = 800,
+    height: Annotated[int, typer.Option(min=3, max=16384, help="Height of the images in pixels.")] = 532,
     gaussians: Annotated[int, typer.Option(min=1, max=10_000_000, help="Number of Gaussians in the field.")] = 100_000,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Turns; the table has medians over them.")] = 7,
     device: Annotated[

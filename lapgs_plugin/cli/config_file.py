@@ -36,7 +36,7 @@ ConfigOption = Annotated[
         is_eager=True,
         callback=_load,
         metavar="FILE",
-        help="TOML file of options, such as the run.toml of a run folder. Options on the command line come first.",
+        help="TOML file of options, such as the run.toml of a run folder. Options on the command line override it.",
     ),
 ]
 

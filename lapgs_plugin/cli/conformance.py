@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -64,7 +65,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers.choice import OWN, RASTERIZERS
+    from lapgs_plugin.rasterizers.choice import RASTERIZERS
     from lapgs_plugin.rasterizers.extensions import installed_extensions
     from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
@@ -75,23 +76,20 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     }
     if torch.cuda.is_available():
         for name in installed_extensions():
-            found[name] = lambda name=name: _extension_subjects(name)  # type: ignore[misc]  # mypy reads no default here
-    if not gsplat.missing():
-        found[gsplat.NAME] = lambda: [
-            Subject(gsplat.NAME, gsplat.GsplatRasterizer(), device="cuda", semantics=gsplat.SEMANTICS)
-        ]
-    for name in (name for name in RASTERIZERS if name not in OWN):
-        found.setdefault(name, lambda name=name: [_package_subject(name)])  # type: ignore[misc]  # as above
+            found[name] = partial(_extension_subjects, name)
+    for name in RASTERIZERS:
+        if name != gsplat.NAME or not gsplat.missing():
+            found.setdefault(name, partial(_subject, name))
     return found
 
 
-def _package_subject(name: str) -> Subject:
-    """Return the rasterizer that an installed package brings."""
+def _subject(name: str) -> list[Subject]:
+    """Return a rasterizer of this package or of an installed one."""
     from lapgs_plugin.evaluation.conformance import Subject
     from lapgs_plugin.rasterizers.choice import placed_rasterizer
 
     placed = placed_rasterizer(name)
-    return Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)
+    return [Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)]
 
 
 def _extension_subjects(name: str) -> list[Subject]:

@@ -183,10 +183,11 @@ def _print_summary(console: Console, metrics: dict[str, Any]) -> None:
     if where and lpips_titles(metrics):
         where += " (LPIPS: the photo outside)"
     overhead = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in metrics["overhead_seconds"].items())
+    seconds = metrics["train_seconds"]  # 0 where a loop of the user's own has measured none
+    optimization = f"optimization [bold]{seconds:.1f} s[/bold]; " if seconds else ""
     console.print(
         f"[bold]{metrics['psnr']:.2f} dB[/bold] PSNR, [bold]{metrics['ssim']:.4f}[/bold] SSIM over "
-        f"{counted(metrics['num_views'], kind)}{scene}{where}; "
-        f"optimization [bold]{metrics['train_seconds']:.1f} s[/bold]; "
+        f"{counted(metrics['num_views'], kind)}{scene}{where}; {optimization}"
         f"at most {metrics['peak_gaussians']:,} Gaussians at once; {metrics['fps']:,.0f} frames a second"
     )
     console.print(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import require_place
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
 
 if TYPE_CHECKING:
@@ -80,9 +80,9 @@ def export(
 
         lapgs export runs/garden --level 1 --out /tmp/base
 
-        lapgs export runs/garden --merge       (residuals as one ordinary field)
+        lapgs export runs/garden --merge    # residuals as one ordinary field
 
-        lapgs export runs/garden --merge --html       (a page for the web)
+        lapgs export runs/garden --merge --html    # a page for the web
     """
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.layout import EXPORT
@@ -146,14 +146,13 @@ def _print_written(path: Path, field: GaussianField, remark: str = "") -> None:
 
 def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> GaussianField:
     """Return a field that approximates the run, and print how well it does."""
-    from rich.console import Console
-
     from lapgs_plugin.training.merge import ITERATIONS, merge_levels
     from lapgs_plugin.training.monitor import ProgressMonitor
 
-    with ProgressMonitor(Console(stderr=True), 1, advice=False) as monitor:
+    with ProgressMonitor(make_console(stderr=True), 1, advice=False) as monitor:
         merged = merge_levels(archive, scene, iterations=iterations or ITERATIONS, monitor=monitor)
-    line = f"{merged.kept:.2f} dB PSNR against the run's own images of {merged.views} views that it was not fitted to"
+    views = counted(merged.views, "view")
+    line = f"{merged.kept:.2f} dB PSNR against the run's own images of {views} that it was not fitted to"
     if merged.photo_psnr is not None:
         line += f"; against the photos {merged.photo_psnr[1]:.2f} dB, where the run has {merged.photo_psnr[0]:.2f}"
         line += ", both after a colour fit" if merged.colors_fitted else ""

@@ -27,10 +27,10 @@ def prepare(
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write.")],
     *,
+    settings: PrepareSettings,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the scene in OUT, or restart unfinished work.")
     ] = False,
-    settings: PrepareSettings,
 ) -> None:
     """Make a scene from photos or a video: recover cameras and points with COLMAP, then undistort the photos.
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, require_place, show_log
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.cli.output import make_console, make_table, require_place, show_log
+from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
 from lapgs_plugin.rendering.options import RenderOptions
 
@@ -187,8 +187,6 @@ def _print_speeds(
     archive: RunArchive, renderer: HierarchyRenderer, level: int, scene: Path | None, settings: RenderSettings
 ) -> None:
     """Print frames per second over the cameras of the views, at another size if one is given."""
-    from rich.table import Table
-
     from lapgs_plugin.rendering.clip import render_size
     from lapgs_plugin.rendering.run import run_scene
     from lapgs_plugin.rendering.speed import measure_speed
@@ -197,7 +195,7 @@ def _print_speeds(
     cameras = [view.camera for split in splits for view in split]
     if settings.size is not None:
         cameras = [camera.resized(*render_size(settings.size)) for camera in cameras]
-    table = Table("", "size", "Gaussians", "ms", "FPS", title=f"median over {len(cameras)} cameras")
+    table = make_table("", "size", "Gaussians", "ms", "FPS")
     for speed in measure_speed(renderer, cameras, level):
         table.add_row(
             speed.what,
@@ -206,6 +204,7 @@ def _print_speeds(
             f"{speed.milliseconds:.2f}",
             f"{speed.fps:.1f}",
         )
+    print(f"Frames a second, medians over {counted(len(cameras), 'camera')}")
     make_console().print(table)
 
 

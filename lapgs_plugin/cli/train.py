@@ -69,10 +69,10 @@ def train(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder: COLMAP, Blender or nerfstudio.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     *,
+    settings: TrainSettings,
+    photos: SceneOptions,
     start: StartOptions,
     config: ConfigOption = None,
-    photos: SceneOptions,
-    settings: TrainSettings,
     control: TrainingControl,
 ) -> None:
     """Train a scene coarse to fine with the built-in trainer, on a GPU (gsplat) or a CPU.
@@ -85,11 +85,11 @@ def train(
 
         lapgs train data/garden -o runs/small --resolution 1/4 --iterations 3000
 
-        lapgs train data/garden -o runs/plain --levels 1    (a single field)
+        lapgs train data/garden -o runs/plain --levels 1    # a single field
 
-        lapgs train data/garden -o runs/nested --hierarchy nested    (one PLY)
+        lapgs train data/garden -o runs/nested --hierarchy nested    # one PLY
 
-        lapgs train data/garden -o runs/garden --resume    (after Ctrl-C)
+        lapgs train data/garden -o runs/garden --resume    # after Ctrl-C
 
         lapgs train data/garden -o runs/garden --resume --iterations 40000
 
@@ -264,6 +264,12 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
     if asked is not None and asked <= done:
         raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
     goal = asked or begun or done
+    if goal == done:
+        make_console(stderr=True).print(
+            f"{run} is finished with {done:,} iterations; --resume --iterations and a larger number extends it",
+            markup=False,
+            soft_wrap=True,
+        )
     return replace(settings, iterations=goal, extended=settings.extended + goal - done)
 
 

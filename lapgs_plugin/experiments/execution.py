@@ -12,6 +12,7 @@ from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
 from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
 from lapgs_plugin.experiments.launchers import Launcher
 from lapgs_plugin.experiments.mistakes import Mistakes
+from lapgs_plugin.experiments.schema import SampleScene
 from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 from lapgs_plugin.scenes.resolution import parse_size
@@ -51,8 +52,11 @@ def prepare(
     where: dict[str, tuple[SceneSpec, Path]] = {}
     for scene in scenes:
         with mistakes.at(mistakes.scene_key(scene.name)):
-            _check_sample(scene)
-            where[scene.name] = (scene, _sample_folder(scene, folder) if scene.sample else places.scene(scene))
+            if scene.sample is None:
+                where[scene.name] = scene, places.scene(scene)
+            else:
+                _check_sample(scene.sample)
+                where[scene.name] = scene, _sample_folder(scene.name, scene.sample, folder)
     checkouts: dict[str, Path] = {}
     for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
         with mistakes.at(f"backbones.{key}.checkout"):
@@ -75,18 +79,15 @@ def prepare(
     return list(jobs.values()), where
 
 
-def _check_sample(scene: SceneSpec) -> None:
+def _check_sample(sample: SampleScene) -> None:
     """Refuse options that no sample scene can have.
 
     Raises:
         UserInputError: the size, the views or the points are out of range.
     """
-    if scene.sample is None:
-        return
     from lapgs_plugin.scenes.sample import check_sample_scene
 
-    width, height = parse_size(scene.sample.size)
-    check_sample_scene(width, height, scene.sample.views, scene.sample.points)
+    check_sample_scene(*parse_size(sample.size), sample.views, sample.points)
 
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
@@ -95,34 +96,26 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
     Raises:
         RunFolderError: another process locks the folder for too long.
     """
-    missing = [(scene, scene.sample) for scene in scenes if scene.sample and not _sample_folder(scene, folder).is_dir()]
-    if not missing:
+    samples = [(_sample_folder(scene.name, scene.sample, folder), scene.sample) for scene in scenes if scene.sample]
+    if all(place.is_dir() for place, _ in samples):
         return
     from lapgs_plugin.scenes.sample import make_sample_scene  # needs packages that read scenes
 
-    place = folder.absolute() / SCENES
-    with one_line_errors(place):
-        place.mkdir(parents=True, exist_ok=True)
-    lock = FolderLock.acquire(place, LOCK_TIMEOUT)
+    parent = folder.absolute() / SCENES
+    with one_line_errors(parent):
+        parent.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock.acquire(parent, LOCK_TIMEOUT)
     try:
-        for scene, sample in missing:
-            if _sample_folder(scene, folder).is_dir():  # another process made it meanwhile
-                continue
-            width, height = parse_size(sample.size)
-            make_sample_scene(
-                _sample_folder(scene, folder),
-                width=width,
-                height=height,
-                views=sample.views,
-                points=sample.points,
-                progress=True,
-            )
+        for place, sample in samples:
+            if not place.is_dir():  # another process may have made it meanwhile
+                width, height = parse_size(sample.size)
+                make_sample_scene(place, width=width, height=height, views=sample.views, points=sample.points)
     finally:
         lock.release()
 
 
-def _sample_folder(scene: SceneSpec, folder: Path) -> Path:
-    return folder.absolute() / SCENES / scene.name
+def _sample_folder(name: str, sample: SampleScene, folder: Path) -> Path:
+    return folder.absolute() / SCENES / f"{name}-{sample.label}"
 
 
 def execute(

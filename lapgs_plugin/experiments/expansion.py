@@ -50,6 +50,7 @@ class RunSpec:
         iterations, seed: of the whole run.
         options: of `lapgs train` or `lapgs run`.
         arguments: of the checkout's script.
+        sample: `schema.SampleScene.label` of a scene that was made, "" for others.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -66,11 +67,13 @@ class RunSpec:
     seed: int
     options: Mapping[str, Any]
     arguments: Sequence[str]
+    sample: str = ""
 
     @cached_property
     def run_id(self) -> str:
         """Name of the run, different for different settings. Variants with equal settings share their runs."""
-        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
+        values = {name: value for name, value in asdict(self).items() if name != "sample" or value}  # runs keep names
+        digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
         last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
         words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
@@ -161,6 +164,7 @@ def _spec(
         seed=seed,
         options=options,
         arguments=[] if backbone.checkout is None else [*published, *backbone.arguments, *variant.arguments],
+        sample="" if scene.sample is None else scene.sample.label,
     )
 
 

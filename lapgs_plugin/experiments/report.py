@@ -17,7 +17,7 @@ from lapgs_plugin.errors import LapgsError, RunFolderError
 from lapgs_plugin.experiments.commands import IMPORTED
 from lapgs_plugin.experiments.execution import RUNS
 from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
-from lapgs_plugin.files import write_text
+from lapgs_plugin.files import is_folder, write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
@@ -32,8 +32,8 @@ TEMPLATE = "experiment.html.jinja"
 COLORS = 8
 """Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
-    "weighted_gaussians": "Gaussians, mean of levels by iterations",
-    "mean_gaussians": "Gaussians at once, mean of iterations",
+    "weighted_gaussians": "Gaussians of levels, weighted by iterations",
+    "mean_gaussians": "Gaussians optimized, mean",
     "gaussians": "Gaussians to render",
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
@@ -252,5 +252,5 @@ def _open(folder: Path, row: Row) -> MeasuredRun:
         RunFolderError: it is missing or damaged.
     """
     path = folder / RUNS / Path(str(row.get("folder", row["run"]))).name
-    archive = RunArchive.open(path / IMPORTED if (path / IMPORTED).is_dir() else path)
+    archive = RunArchive.open(path / IMPORTED if is_folder(path / IMPORTED) else path)
     return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})

@@ -51,6 +51,11 @@ class SampleScene(_StrictModel):
     views: int = Field(40, ge=2)
     points: int = Field(4000, ge=1)
 
+    @property
+    def label(self) -> str:
+        """A name for these options, such as 480x320-40-4000."""
+        return f"{self.size.strip().lower()}-{self.views}-{self.points}"
+
 
 class Scenes(_StrictModel):
     """One `[[scenes]]` table: a standard data set, a folder, or the sample scene.

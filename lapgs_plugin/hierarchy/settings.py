@@ -161,7 +161,7 @@ class HierarchySettings:
         names=("--prediction-precision", "--cache-precision"),
         choices=(AUTO, *PRECISIONS),
     )
-    seed: int = option(0, "Seed of all random choices of lapgs.")
+    seed: int = option(0, "Seed of all random choices of lapgs.", panel="Run")
 
     def __post_init__(self) -> None:
         check_values(self)

@@ -85,7 +85,7 @@ def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tup
     on_gpu, obstacle = device != "cpu" and torch.cuda.is_available(), ""
     if on_gpu or trained in RASTERIZERS:  # on a CPU an extension has a stand-in only, which is slow
         try:
-            return _named(trained, device, settings), "the one it was trained with"
+            return _named(trained, device, settings), "as in training"
         except LapgsError as error:
             obstacle = str(error).partition("; ")[0]  # without advice: another one renders
     if not on_gpu:
@@ -171,7 +171,7 @@ def _split(settings: Mapping[str, Any], known: Container[str]) -> tuple[dict[str
 def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     name = placed.rasterizer.name
     place = torch.cuda.get_device_name() if placed.device.type == "cuda" else "the CPU"
-    line = f"rendering with {name} on {place}: {why}"
+    line = f"rendering with {'the CPU rasterizer' if name == 'cpu' else f'{name} on {place}'}: {why}"
     if name != manifest.rasterizer:
         line += f"; the run was trained with {manifest.rasterizer}, images may differ slightly"
     if placed.unsupported:

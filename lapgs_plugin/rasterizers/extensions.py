@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.environment import is_installed
-from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
@@ -251,7 +251,7 @@ def import_extension(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise MissingExtraError(
-            f"{name} cannot be imported ({error}); install it as the README of its backbone says"
+            f"{name} cannot be imported ({first_line(error)}); install it as the README of its backbone says"
         ) from error
 
 

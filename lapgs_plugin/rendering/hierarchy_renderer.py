@@ -10,10 +10,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import AS_TRAINED, Composition, compose, scaled
@@ -121,7 +122,8 @@ class HierarchyRenderer:
                     raise
                 whole = f"what was trained before it is whole: `lapgs render --level {min(fields)}`"
                 raise RunFolderError(f"{error}; {whole}") from error
-        return cls.of(manifest, fields, rasterizer, FieldOffload(torch.device(device), keep))
+        with errors_about(archive.path(MANIFEST)):
+            return cls.of(manifest, fields, rasterizer, FieldOffload(torch.device(device), keep))
 
     @classmethod
     def of(

@@ -70,9 +70,10 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
     """
     reference, path = _scene_folder(archive, moved_to)
     if reference.masks not in (NONE, ALPHA) and not is_folder(path / reference.masks):
+        otherwise = "" if moved_to is None else " or give the scene of this run with --scene"
         raise RunFolderError(
             f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
-            "put them back"
+            f"put them back{otherwise}"
         )
     with errors_about(archive.path(MANIFEST)):
         scene = load_reference(replace(reference, path=str(path)))

@@ -200,7 +200,7 @@ def _stage_marks(history: History, x: str) -> list[Mark]:
 def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
     """Draw time against Gaussians, as an arrow from the baseline to the run."""
     ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
-    label = "Gaussians, mean of levels by iterations"
+    label = "Gaussians of levels, weighted by iterations"
     return draw_arrows("Optimization (s) against Gaussians", label, [Arrow(RUN, "", *ends)])
 
 

@@ -11,14 +11,24 @@ from typing import Any
 import torch
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
-from lapgs_plugin.errors import DeviceMemoryError, FieldError, LapgsError, TrainingDivergedError, first_line, typed_line
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    FieldError,
+    LapgsError,
+    TrainingDivergedError,
+    UserInputError,
+    first_line,
+    typed_line,
+)
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pruning import unpruned_line
+from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_record import StageRecord
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
 
@@ -149,7 +159,7 @@ class ActiveStage:
             LapgsError: training left nothing to archive.
         """
         self.begin()
-        self._call.run()
+        self._context.returned = self._call.run()
         self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 
@@ -195,6 +205,7 @@ class ActiveStage:
         self.record.archive(result, None if self._joint is None else self._joint.fields(self._exported))
         if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
+        self._compare(gaussians, field)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
@@ -300,6 +311,24 @@ class ActiveStage:
                 "eval` measures the run",
                 *(self.stage.level, typed_line(error)),
             )
+
+    def _compare(self, gaussians: Any, field: GaussianField) -> None:
+        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run.
+
+        Raises:
+            UserInputError: they differ, and a residual would be added to another image than the checkout's.
+        """
+        builds_on = self.stage.level > 0 and not self._options.nested
+        if self.stage.level > 0 and not builds_on:
+            return
+        rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)
+        with self.record.after_archive("evaluation"), torch.no_grad():
+            self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
+            assert rendering.call is not None, "as it captures"
+            problem = explain_other_values(self._adapter, rendering.call, field)
+        if problem and builds_on:
+            raise UserInputError(f"{problem}; {NO_RESIDUALS}; level {self.stage.level} is in the run folder")
+        self._context.warn_of_other_images(problem)
 
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""

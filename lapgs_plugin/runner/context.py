@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +17,7 @@ from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.archived_values import ADAPTER_MENDS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
@@ -27,17 +29,17 @@ from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass
-class Running:
-    """Hold the stage, or that of the dry run, which answers the replaced symbols; None between stages."""
-
-    stage: Any = None
-
-
-@dataclass(frozen=True)
 class RunContext:
-    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`."""
+    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
+
+    Attributes:
+        stage: the running stage, or that of the dry run, which answers the replaced symbols; None between stages.
+        returned: what the script's last call of `training` returned, for its main block.
+    """
 
     adapter: BackboneAdapter
     options: RunSettings
@@ -48,7 +50,16 @@ class RunContext:
     parts: IterationParts
     watcher: Watcher
     measuring: MeasuringOptions
-    running: Running = field(default_factory=Running)
+    stage: Any = None
+    returned: Any = None
+    _told: set[str] = field(default_factory=set)
+
+    def warn_of_other_images(self, problem: str) -> None:
+        """Warn once, if there is a problem, that archived fields show other images than the checkout."""
+        if problem and problem not in self._told:
+            self._told.add(problem)
+            line = f"{problem}: lapgs eval, render and view show other images than the checkout's own render"
+            logger.warning("%s; %s", line, ADAPTER_MENDS)
 
     def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""

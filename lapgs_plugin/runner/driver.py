@@ -15,6 +15,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import shlex
 import shutil
 import tempfile
 import uuid
@@ -114,7 +115,7 @@ class HierarchyDriver:
         with (
             Attachment(self._replacements.all()),
             self._context.parts.watching_optimizers(),
-            counting_steps(self._adapter.profile, lambda: self._context.running.stage),
+            counting_steps(self._adapter.profile, lambda: self._context.stage),
         ):
             self._adapter.script.run_main()
 
@@ -159,7 +160,7 @@ class HierarchyDriver:
                     # A run that is continued makes its images again.
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
-        logger.info("run folder: %s", folder)
+        logger.info("run folder: %s; next: `lapgs eval %s`", folder, shlex.quote(str(folder)))
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
@@ -169,7 +170,7 @@ class HierarchyDriver:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
             active = ActiveStage(self._context, run, window, call, tuple(finished), before)
-            self._context.running.stage = active
+            self._context.stage = active
             try:
                 active.load_images()
                 if stage.level in run.archive.available_levels:
@@ -180,7 +181,7 @@ class HierarchyDriver:
             except torch.cuda.OutOfMemoryError as error:
                 raise active.out_of_memory(error) from error
             finally:
-                self._context.running.stage = None
+                self._context.stage = None
                 active.close()
             finished.append(FinishedStage(stage, call))
 

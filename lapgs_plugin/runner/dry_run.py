@@ -31,11 +31,12 @@ from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
+from lapgs_plugin.runner.archived_values import NESTED_WORKS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
-from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
 
 logger = logging.getLogger(__name__)
@@ -43,14 +44,10 @@ logger = logging.getLogger(__name__)
 MOST_POINTS = 20_000
 """About how many of the scene's points the dry run starts from."""
 
-SAME_VALUE = 1e-3
-"""Largest relative difference of a scale or opacity from the archived one: logits and logarithms round to 1e-6."""
-
 NATIVE_COEFFICIENTS = 15
 """SH coefficients above the first that a rasterizer may read when it does not know the flag of signed colour."""
 
 OFF = "`lapgs run --off` runs the script as it is"
-NESTED_WORKS = "nested levels work: --hierarchy nested"
 
 
 class DryRun:
@@ -67,7 +64,7 @@ class DryRun:
         self._context, self._scene, self._plan = context, scene, plan
         self._adapter = context.adapter
         self._call = call
-        self._inputs: Mapping[str, Any] = {}
+        self._captured: Captured | None = None  # the last render
         self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
         # Residuals ask for more than other stages do.
         self._stage = next((stage for stage in plan if stage.signed), next(iter(plan)))
@@ -110,7 +107,12 @@ class DryRun:
         Raises:
             UserInputError: it cannot; the line says what failed, where, and what works.
         """
-        with _undisturbed(self._context.device), self._step("signed colour", "negative colours", NESTED_WORKS):
+        with (
+            _undisturbed(self._context.device),
+            self._step(
+                "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_WORKS
+            ),
+        ):
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
             self._require_parameters(gaussians)
@@ -129,7 +131,7 @@ class DryRun:
                 raise _Enough  # the loop would run to its end
 
         self._context.wrapper.rendering = stage.rendering
-        self._context.running.stage = stage
+        self._context.stage = stage
         watching = register_optimizer_step_post_hook(stepped)
         try:
             with self._step("the first iteration", "one as without lapgs", works):
@@ -139,7 +141,7 @@ class DryRun:
         finally:
             watching.remove()
             self._context.wrapper.rendering = None
-            self._context.running.stage = None
+            self._context.stage = None
         if stage.iteration == 0:
             raise UserInputError(
                 f"{self._training_place}: {stage.call.function.__name__}() began no iteration, expected one call of "
@@ -173,7 +175,7 @@ class DryRun:
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
         call = self._call if path is None else self._adapter.call_of_residuals(self._call)
         image = self._context.render(rendering, call, view, gaussians, black=True)
-        self._inputs = rendering.inputs
+        self._captured = rendering.call
         return image
 
     def _compare(self, field: GaussianField) -> None:
@@ -182,24 +184,12 @@ class DryRun:
         Raises:
             UserInputError: they differ, and a residual would be added to another image than the checkout's.
         """
-        rendered = {
-            "positions": ("means3D", field.means),
-            "scales": ("scales", field.log_scales.exp()),
-            "opacities": ("opacities", field.opacity_logits.sigmoid()[:, None]),
-        }
-        differ = [what for what, (name, value) in rendered.items() if not _alike(self._inputs.get(name), value)]
-        if not differ:
-            return
-        problem = (
-            f"{self._adapter.profile.source.model[1]}: the checkout renders other {' and '.join(differ)} than its "
-            "model has as parameters, from which fields are archived"
-        )
-        mend = "an adapter whose snapshot() returns what is rendered mends it (docs/extending.md)"
-        if self._stage.signed:
-            raise UserInputError(f"{problem}; expected the same, to which a residual is added; {mend}, {NESTED_WORKS}")
-        logger.warning(
-            "%s: lapgs eval, render and view show other images than the checkout's own render; %s", problem, mend
-        )
+        assert self._captured is not None, "a view was rendered"
+        with self._step("the last render repeated", "an image (3, h, w)", OFF):
+            problem = explain_other_values(self._adapter, self._captured, field)
+        if problem and self._stage.signed:
+            raise UserInputError(f"{problem}; {NO_RESIDUALS}")
+        self._context.warn_of_other_images(problem)
 
     def _require_parameters(self, gaussians: Any) -> None:
         """Refuse a model that lacks what a field has, unless its adapter makes fields otherwise."""
@@ -339,14 +329,6 @@ class _Nothing:
     def get(self, key: str) -> Tensor:
         width, height = self._sizes[key]
         return torch.zeros(3, height, width, device=self._device)
-
-
-def _alike(given: Any, value: Tensor) -> bool:
-    """Return whether an input of a rasterizer has the values of a field; True if it cannot be compared."""
-    if not isinstance(given, Tensor) or given.ndim != 2 or len(given) != len(value):
-        return True
-    axes = min(given.shape[1], value.shape[1])  # flat Gaussians have two scales, and get a third one in fields
-    return torch.allclose(given[:, :axes].detach(), value[:, :axes], rtol=SAME_VALUE, atol=SAME_VALUE**2)
 
 
 def _some(points: Any) -> Any:

@@ -42,6 +42,16 @@ class RasterOutputs:
         image = stored.reshape(stored.shape[-3:])  # some have a leading axis for several views
         return image.permute(2, 0, 1) if self.channels_last else image
 
+    @property
+    def maps_beside(self) -> list[Tensor]:
+        """Other outputs with a value of each pixel that gradients may come from, such as depths."""
+        if self.place is None:
+            return []
+        items = self.outputs.items() if isinstance(self.outputs, dict) else enumerate(self.outputs)
+        others = [v for place, v in items if place != self.place and isinstance(v, Tensor) and v.requires_grad]
+        size = tuple(self.image.shape[1:])
+        return [v for v in others if size in (tuple(v.shape[-2:]), tuple(v.shape[-3:-1]))]
+
     def with_image(self, image: Tensor) -> Any:
         """Return the outputs with another image (3, h, w) in the place and shape of the first."""
         image = (image.permute(1, 2, 0) if self.channels_last else image).reshape(self._stored.shape)

@@ -8,9 +8,11 @@ with: its matrices may be copied, moved or made anew on the way to the rasterize
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,12 +32,14 @@ class _RendererCall:
     Attributes:
         way: the renderer, and whether its arguments ask it to evaluate SH itself; None outside of renderers.
         key: key of the view; None for other cameras.
+        place: file and line of the call.
         given: values of each Gaussian (n, k) among its arguments, such as colours to render instead.
         done: not empty once the model's colours were rasterized.
     """
 
     way: tuple[Callable[..., Any], bool] | None = None
     key: str | None = None
+    place: str = "the checkout"
     given: tuple[Tensor, ...] = ()
     done: list[bool] = field(default_factory=list)
 
@@ -69,7 +73,11 @@ class RasterizerWrapper:
             key = next((key for v in given if (key := view_key(v)) is not None), outer.key)
             values = tuple(v for v in given if isinstance(v, Tensor) and v.ndim == 2)
             way = original, any(getattr(v, "convert_SHs_python", False) is True for v in given)
-            self.running = _RendererCall(way, key, (*outer.given, *values))
+            place = outer.place
+            if outer.way is None:
+                caller = sys._getframe(1)
+                place = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
+            self.running = _RendererCall(way, key, place, (*outer.given, *values))
             try:
                 return original(*args, **kwargs)
             finally:
@@ -137,8 +145,8 @@ class RasterizerWrapper:
                 return outputs
 
             if not _has_model_colors(inputs, running, self._ways_of_sh):
-                return rendering.render_other(marked, inputs, settings)
-            return rendering.render(marked, inputs, settings, running.key)
+                return rendering.render_other(marked, inputs, settings, running.place)
+            return rendering.render(marked, inputs, settings, running.key, running.place)
 
         return call
 

@@ -59,7 +59,7 @@ class StageReplacements:
         ]
 
     def _running(self) -> ActiveStage | None:
-        stage: ActiveStage | None = self._context.running.stage
+        stage: ActiveStage | None = self._context.stage
         return stage
 
     def _in_residual(self) -> bool:
@@ -99,10 +99,11 @@ class StageReplacements:
         found = profile.named(names) if hooks else []
         return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in found]
 
-    def _make_training(self, original: Callable[..., None]) -> Callable[..., None]:
+    def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
-        def training(*args: Any, **kwargs: Any) -> None:
+        def training(*args: Any, **kwargs: Any) -> Any:
             self._train(TrainingCall.bind(original, args, kwargs))
+            return self._context.returned
 
         return training
 

@@ -92,7 +92,7 @@ class SingleCall:
             if self._done:
                 self._run_from(stage.window.start)
             else:
-                self._call.run()
+                self._context.returned = self._call.run()
             level, done = self._stage.stage.level, self._stage.window.start + self._stage.iteration
             self._stage.require_trained(done, self._plan.iterations, ended=level == 0)
             self._stage.finish()
@@ -102,7 +102,7 @@ class SingleCall:
             self._explain_failure(self._stage)
             raise
         finally:
-            self._context.running.stage = None
+            self._context.stage = None
             self._stage.close()
 
     def _explain_failure(self, stage: NestedStage) -> None:
@@ -127,7 +127,7 @@ class SingleCall:
         given = self._run.call.opt
         for name in self._context.adapter.densify_thresholds(given):
             setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
-        self._context.running.stage = stage
+        self._context.stage = stage
         stage.load_images()
         stage.begin()
 
@@ -173,4 +173,4 @@ class SingleCall:
         with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment(keeping):
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
-            self._call.changed(**dict.fromkeys(takes, str(path))).run()
+            self._context.returned = self._call.changed(**dict.fromkeys(takes, str(path))).run()

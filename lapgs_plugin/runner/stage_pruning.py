@@ -34,11 +34,11 @@ def require_pruning(call: TrainingCall, share: float, model: type) -> None:
     if not share:
         return
     try:
-        inspect.signature(model.prune_points).bind(None, None)  # type: ignore[attr-defined]  # the fork's
+        inspect.signature(getattr(model, "prune_points", None)).bind(None, None)  # type: ignore[arg-type]  # is refused
     except TypeError as error:
         raise UserInputError(
-            f"--prune {share}: {model.__name__}.prune_points() of the checkout takes more than a mask ({error}); leave "
-            "--prune out"
+            f"--prune {share}: {model.__name__} of the checkout has no prune_points() that takes a mask alone "
+            f"({error}); leave --prune out"
         ) from error
     if pruning_iteration(call) is None:
         given = ", ".join(f"--{name} {getattr(call.opt, name, 'missing')}" for name in (*DENSIFICATION, "iterations"))

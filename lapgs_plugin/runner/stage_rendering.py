@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -36,6 +37,25 @@ class Predictions(Protocol):
         """Return the prediction (3, h, w) on the device, float32, at the size of the finer level."""
 
 
+@dataclass(frozen=True)
+class Captured:
+    """Hold the last call of a checkout's rasterizer for a model's colours.
+
+    Attributes:
+        rasterizer: with its settings.
+        inputs: by name.
+        size: (h, w) of the view.
+    """
+
+    rasterizer: Callable[..., Any]
+    inputs: Mapping[str, Any]
+    size: tuple[int, ...]
+
+    def image(self, **others: Any) -> Tensor:
+        """Return the image (3, h, w) with other values of some inputs, not composed."""
+        return RasterOutputs.of(self.rasterizer(**{**self.inputs, **others}), self.size).image
+
+
 @dataclass
 class StageRendering:
     """Describe to the rasterizer's wrapper how a stage is rendered.
@@ -50,7 +70,7 @@ class StageRendering:
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
-        capture: keep the last composed image, before exposure or clamping, in `captured`, and the rasterizer's inputs.
+        capture: keep the last composed image, before exposure or clamping, in `captured`, and its call in `call`.
     """
 
     signed: bool
@@ -63,7 +83,7 @@ class StageRendering:
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
     captured: Tensor | None = field(default=None, repr=False)
-    inputs: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    call: Captured | None = field(default=None, repr=False)
     _told: bool = field(default=False, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 
@@ -157,20 +177,45 @@ class StageRendering:
             image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
-    def render(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, noted: str | None) -> Any:
-        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image."""
+    def render(
+        self,
+        rasterizer: Callable[..., Any],
+        inputs: dict[str, Any],
+        settings: Any,
+        noted: str | None,
+        place: str = "the checkout",
+    ) -> Any:
+        """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image.
+
+        Args:
+            rasterizer, inputs, settings: of the call.
+            noted: key of the view that a renderer was called with; None if it was called with none.
+            place: file and line where the checkout renders it.
+
+        Raises:
+            UserInputError: as `compose`; in the backward pass of a residual's maps beside the image, because they do
+                not show the whole scene.
+        """
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
         image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
-            self.captured, self.inputs = image, inputs
+            self.captured, self.call = image, Captured(rasterizer, inputs, size_of(settings))
+        for each in outputs.maps_beside if self.signed else ():
+            each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)
 
-    def render_other(self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any) -> Any:
+    def render_other(
+        self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, place: str = "the checkout"
+    ) -> Any:
         """Return the outputs for colours that are not the model's, such as features or scores, as they are.
 
         Nothing of the photos belongs into such an image. Of a residual it is its own only, of which a warning tells.
+
+        Args:
+            rasterizer, inputs, settings: as of `render`.
+            place: file and line where the checkout renders them.
 
         Raises:
             UserInputError: in the backward pass of a residual's: it is no image of the whole scene.
@@ -181,14 +226,15 @@ class StageRendering:
         if self.images is not None and not (self.capture or self._told):
             self._told = True
             logger.warning(
-                "the checkout also renders other values than colours, such as depths or opacities; in a residual they "
-                "are those of its own Gaussians, not the scene's: leave out options that use them, or train with "
-                "--hierarchy nested"
+                "%s also renders other values than colours, such as depths or opacities; in a residual they are those "
+                "of its own Gaussians, not the scene's: leave out options that use them, or train with "
+                "--hierarchy nested",
+                place,
             )
         found = RasterOutputs.of(outputs, size_of(settings))
         image = found.image.clone()  # the hook is to see uses of this image alone
         if image.requires_grad:
-            image.register_hook(_refuse_other_colors)  # type: ignore[no-untyped-call]  # torch's
+            image.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
         return found.with_image(image)
 
     @property
@@ -203,11 +249,13 @@ class StageRendering:
         return self.accumulated if coarse is None else coarse
 
 
-def _refuse_other_colors(_: Tensor) -> None:
+def _refuse_other_colors(place: str, gradient: Tensor | None) -> None:
+    if gradient is None or not bool(gradient.any()):  # its loss has no weight
+        return
     raise UserInputError(
-        "the checkout trains on an image of other colours than the model's, such as depths or features; a residual "
-        "covers a part of the scene only, so its image of them is not the whole one: leave the option out that asks "
-        "for it, or train with --hierarchy nested"
+        f"{place}: the loop trains on an image of other colours than the model's, such as depths or features; a "
+        "residual covers a part of the scene only, so its image of them is not the whole one: leave the option out "
+        "that asks for it, or train with --hierarchy nested"
     )
 
 

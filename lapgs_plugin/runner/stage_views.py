@@ -119,9 +119,9 @@ class StageViews:
             (self._full_size(gaussians, key), full[key].load(device), masks.get(key)) for key in self.test
         )
 
-    def render_alone(self, rendering: StageRendering, gaussians: Any, key: str) -> Tensor:
-        """Return the image (3, h, w) of a view over black; `rendering` replaces the stage's meanwhile."""
-        return self._context.render(rendering, self._call, self._view(key), gaussians, black=True)
+    def render_alone(self, rendering: StageRendering, gaussians: Any, key: str, *, black: bool = True) -> Tensor:
+        """Return the image (3, h, w) of a view; `rendering` replaces the stage's, `black` the call's background."""
+        return self._context.render(rendering, self._call, self._view(key), gaussians, black=black)
 
     def take_over(self, before: StageViews) -> None:
         """Bring the views of another stage to this one's level: the checkout's training holds the objects."""

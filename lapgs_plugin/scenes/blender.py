@@ -25,12 +25,12 @@ from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.source import (
     LARGEST,
     PINHOLE_MODELS,
-    UNDISTORT_HINT,
     Frame,
     SceneSource,
     check_camera,
     hold_out,
     in_name_order,
+    undistort_hint,
 )
 from lapgs_plugin.untrusted import read_json
 
@@ -161,7 +161,7 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
                 f"{where} names {image}: no such image; put it there or choose another folder with --images"
             )
         posed = {**values, **frame}
-        _refuse_distortion(posed, where)
+        _refuse_distortion(posed, where, image.parent)
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
         camera = read_camera(posed, where)
@@ -170,14 +170,14 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
     return frames
 
 
-def _refuse_distortion(values: Values, where: str) -> None:
+def _refuse_distortion(values: Values, where: str, photos: Path) -> None:
     model = values.get("camera_model") or "OPENCV"
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
     if np.any(values.get("distortion_params") or 0.0):
         distortion["distortion_params"] = values["distortion_params"]
     if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
         terms = "".join(f", {key} = {value}" for key, value in distortion.items())
-        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {UNDISTORT_HINT}")
+        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {undistort_hint(photos)}")
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:

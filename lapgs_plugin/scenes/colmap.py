@@ -19,7 +19,7 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
 from lapgs_plugin.scenes.images import find_image
-from lapgs_plugin.scenes.source import PINHOLE_MODELS, UNDISTORT_HINT, Frame, SceneSource, check_camera, hold_out
+from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource, check_camera, hold_out, undistort_hint
 
 MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -55,7 +55,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         raise SceneError(f"{folder}: no such folder of images; {hint}")
     posed = [image for image in reconstruction.images.values() if image.has_pose]
     used = sorted({image.camera_id for image in posed})
-    cameras = {key: _intrinsics(reconstruction.cameras[key], model) for key in used}
+    cameras = {key: _intrinsics(reconstruction.cameras[key], model, folder) for key in used}
     frames = [_frame(model, folder, cameras[image.camera_id], image) for image in posed]
     points = [(point.xyz, point.color) for point in reconstruction.points3D.values()]
     if not points:
@@ -96,13 +96,13 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def _intrinsics(camera: pycolmap.Camera, model: Path) -> Camera:
+def _intrinsics(camera: pycolmap.Camera, model: Path, photos: Path) -> Camera:
     """Return the camera without a pose."""
     kind = camera.model.name
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     if kind not in PINHOLE_MODELS or any(distortion):
         values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
-        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {UNDISTORT_HINT}")
+        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {undistort_hint(photos)}")
     matrix = camera.calibration_matrix()  # (3, 3)
     return Camera(
         width=camera.width,

@@ -79,8 +79,11 @@ def _lines(file: Path, pairs: bool) -> Iterator[_Line]:
             for number, text in numbered:
                 if (stripped := text.strip()) and not stripped.startswith("#"):
                     yield _Line(file, number, stripped)
-                    if pairs:
-                        _check_observations(_Line(file, number + 1, next(numbered, (0, ""))[1].strip()))
+                    if not pairs:
+                        continue
+                    observations = _Line(file, number + 1, next(numbered, (0, ""))[1].strip())
+                    if len(observations.words) % 3:
+                        observations.refuse("X Y POINT3D_ID for each observation")
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{file}: not readable as text in UTF-8 ({error}); copy or export the model again") from error
 
@@ -115,11 +118,6 @@ def _check_image(line: _Line, cameras: set[int], names: dict[int, str]) -> int:
         line.refuse(f"the id of a camera in cameras.txt, there is no {camera}")
     names[key] = line.text.split(maxsplit=9)[9]
     return key
-
-
-def _check_observations(line: _Line) -> None:
-    if len(line.words) % 3:
-        line.refuse("X Y POINT3D_ID for each observation")
 
 
 def _check_point(line: _Line, images: set[int]) -> int:

@@ -18,11 +18,13 @@ class SceneOptions:
         UserInputError: the background is no colour.
     """
 
+    eval: bool = option(False, "Hold out every eighth view for `lapgs eval`; of a Blender scene its test views.")
     resolution: str = option(
-        "full", "Image size: 1k, 2k or 4k as in the paper, full, a width such as 800, or a fraction such as 1/4."
+        "full",
+        "Image size: 1k, 2k or 4k as in the paper, full, a width such as 800, a fraction such as 1/4, or 3dgs:N as the "
+        "option -r N of 3DGS codebases.",
     )
     images: str = option("images", "Image folder of the scene, such as images_4.")
-    eval: bool = option(False, "Hold out every eighth view for `lapgs eval`; of a Blender scene its test views.")
     masks: str = option(
         "auto",
         "Masks of the photos: a folder of images that are black where a photo is ignored, alpha (the photos' own alpha "

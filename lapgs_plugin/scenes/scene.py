@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from shlex import quote
 
 import numpy as np
 import torch
@@ -37,6 +38,9 @@ from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
 EXTENT_MARGIN = 1.1
+FAR = 1e3
+"""Distance of the cameras from the origin, in extents, from which on positions are rounded to a tenth of a pixel of 1K
+images. Models in coordinates of a map are further away."""
 
 logger = logging.getLogger(__name__)
 
@@ -228,12 +232,15 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _what_to_give(path: Path) -> str:
-    """Return the advice for a folder that is no scene: the scene or the photos in it."""
-    folders = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
+    inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
-    photos = next((str(each) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS")
+    photos = next(
+        (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
+    )
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 
@@ -294,5 +301,11 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
     if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
         raise SceneError(
             f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
+        )
+    if (away := float(centers.mean(dim=0).norm())) > FAR * extent:
+        logger.warning(
+            "%s: the cameras are %.3g from the origin, %.3g times the scene's extent, where float32 numbers are %.1g "
+            "apart: fine detail is lost; move the model to the origin, for example with COLMAP's model_transformer",
+            *(path, away, away / extent, np.spacing(np.float32(away))),
         )
     return extent

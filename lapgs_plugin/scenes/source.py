@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,6 @@ HOLD_OUT_EVERY = 8
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
-
-UNDISTORT_HINT = (
-    "only pinhole images can be trained on; `lapgs prepare PHOTOS OUT` undistorts photos, as does COLMAP's "
-    "image_undistorter"
-)
 
 LARGEST = 1e12
 """Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
@@ -66,6 +62,14 @@ class SceneSource:
     colors: NDArray[np.float64]  # (n, 3)
 
 
+def undistort_hint(photos: Path) -> str:
+    """Return what to do about distorted photos in a folder."""
+    return (
+        f"only pinhole images can be trained on; `lapgs prepare {quote(str(photos))} OUT` undistorts photos, as does "
+        "COLMAP's image_undistorter"
+    )
+
+
 def check_camera(who: str, camera: Camera) -> None:
     """Refuse a camera that cannot be trained on or rendered from.
 
@@ -77,30 +81,21 @@ def check_camera(who: str, camera: Camera) -> None:
         SceneError: the camera has NaN, inf, numbers too large for float32, or a size or focal length out of range.
     """
     numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    pose = camera.world_to_camera.numpy()
-    if not (np.isfinite(numbers).all() and np.isfinite(pose).all()):
-        raise SceneError(f"{who} has NaN or inf; reconstruct or export it again")
-    if np.abs(pose).max() > LARGEST:
-        raise SceneError(
-            f"{who} has {np.abs(pose).max():g} in its pose, expected at most {LARGEST:g}; reconstruct or export it "
-            "again"
-        )
-    size = camera.size
-    if min(camera.fx, camera.fy, *size) <= 0:
-        raise SceneError(
-            f"{who} is {camera.width}x{camera.height} pixels with focal lengths {camera.fx:g} and {camera.fy:g}, "
-            "expected positive numbers; reconstruct or export it again"
-        )
-    if max(size) > LONGEST_SIDE:
-        raise SceneError(
-            f"{who} is {max(size):.3g} pixels wide or high, expected at most {LONGEST_SIDE}; reconstruct or export it "
-            "again"
-        )
-    if (np.abs(numbers) > LONGEST_FOCAL * np.array([*size, *size])).any():
-        raise SceneError(
-            f"{who} has focal lengths {camera.fx:g} and {camera.fy:g} and a principal point ({camera.cx:g}, "
-            f"{camera.cy:g}), expected at most {LONGEST_FOCAL:g} sides of the image; reconstruct or export it again"
-        )
+    pose, size = camera.world_to_camera.numpy(), camera.size
+    furthest, lens = np.abs(pose).max(), f"focal lengths {camera.fx:g} and {camera.fy:g}"
+    for wrong, what in (
+        (not (np.isfinite(numbers).all() and np.isfinite(pose).all()), "NaN or inf"),
+        (furthest > LARGEST, f"{furthest:g} in its pose, expected at most {LARGEST:g}"),
+        (min(camera.fx, camera.fy, *size) <= 0, f"{size[0]}x{size[1]} pixels and {lens}, expected positive numbers"),
+        (max(size) > LONGEST_SIDE, f"an image {max(size):.3g} pixels wide or high, expected at most {LONGEST_SIDE}"),
+        (
+            (np.abs(numbers) > LONGEST_FOCAL * np.array([*size, *size])).any(),
+            f"{lens} and a principal point ({camera.cx:g}, {camera.cy:g}), expected at most {LONGEST_FOCAL:g} sides of "
+            "the image",
+        ),
+    ):
+        if wrong:
+            raise SceneError(f"{who} has {what}; reconstruct or export it again")
 
 
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:

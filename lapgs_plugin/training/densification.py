@@ -195,14 +195,23 @@ class Densifier(DensityControl):
 
     def _gradient(self, result: RenderResult) -> Tensor:
         """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
-        gradient = result.absgrad2d if self._strategy.absgrad else result.means2d.grad
-        if gradient is None:
-            source = "absgrad2d" if self._strategy.absgrad else "means2d.grad"
-            raise UserInputError(
-                f"--strategy densifies by the RenderResult's {source}, which this rasterizer leaves empty; choose "
-                "--strategy mcmc, which needs none, or another --rasterizer"
-            )
-        return gradient
+        if self._strategy.absgrad:
+            return required(result.absgrad2d, "absgrad2d")
+        return required(result.means2d.grad, "means2d.grad")
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:
         reset_opa(model.params, model.optimizers, self.state, value=highest)
+
+
+def required(gradient: Tensor | None, source: str) -> Tensor:
+    """Return a gradient of a `RenderResult`.
+
+    Raises:
+        UserInputError: the rasterizer left it empty.
+    """
+    if gradient is None:
+        raise UserInputError(
+            f"--strategy densifies by the RenderResult's {source}, which this rasterizer leaves empty; choose "
+            "--strategy mcmc, which needs none, or another --rasterizer"
+        )
+    return gradient

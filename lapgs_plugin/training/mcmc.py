@@ -38,7 +38,7 @@ SOLID = 0.1
 """Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
 
 
-def mcmc_start(field: GaussianField, scale: float = START_SCALE) -> GaussianField:
+def mcmc_start(field: GaussianField, scale: float) -> GaussianField:
     """Return a field from points with its sizes times `scale`, half opaque."""
     return field.with_parameters(
         {

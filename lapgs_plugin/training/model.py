@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,7 +81,7 @@ class TrainableField:
         params = {name: torch.nn.Parameter(value.detach().clone().contiguous()) for name, value in splats.items()}
         rate = _rates(field, rates, extent)
         rate |= {"sh0": rate["sh"], "shN": rate["sh"] * SH_REST_SCALE}
-        optimizers = {name: gpu_adam(param, rate[name], sparse) for name, param in params.items()}
+        optimizers = {name: _gpu_adam(param, rate[name], sparse) for name, param in params.items()}
         return cls(params, optimizers, field.signed, sparse, rate["shN"])
 
     def __len__(self) -> int:
@@ -132,19 +132,24 @@ class TrainableField:
             return
         if scale.gradient != 1.0:
             torch._foreach_mul_([p.grad for p in self.params.values() if p.grad is not None], scale.gradient)
-        if all(isinstance(optimizer, torch.optim.Adam) for optimizer in optimizers):
-            fused_steps(optimizers, scale.views)
-            return
         for optimizer in optimizers:
-            group = optimizer.param_groups[0]
-            if self.sparse:
-                betas = group["betas"]
-                group["betas"] = tuple(beta**scale.views for beta in betas)
-                optimizer.step(self._touched)
-                group["betas"] = betas
-            else:
-                group["views"] = scale.views
+            if isinstance(optimizer, FieldAdam):
+                optimizer.param_groups[0]["views"] = scale.views
                 optimizer.step()
+            else:
+                self._step_counting_views(optimizer, scale.views)
+
+    def _step_counting_views(self, optimizer: Any, views: int) -> None:
+        """Make a step for several views of PyTorch's or gsplat's Adam, whose betas and count are those of one view."""
+        group, states = optimizer.param_groups[0], optimizer.state.values()
+        betas = group["betas"]
+        group["betas"] = tuple(beta**views for beta in betas)
+        for state in filter(None, states) if views > 1 else ():
+            state["step"] /= views
+        optimizer.step(*([self._touched] if self.sparse else []))
+        for state in filter(None, states) if views > 1 else ():
+            state["step"] *= views
+        group["betas"] = betas
 
     def _scale_rest_of_sh(self, factor: float) -> None:
         """Set the step size of SH above degree 0 to its rate times `factor`."""
@@ -260,7 +265,7 @@ def _cpu_adam(param: torch.nn.Parameter, rate: float, rest_scale: float) -> Fiel
     return FieldAdam([param], lr=rate, eps=ADAM_EPS, column_scale=scale)
 
 
-def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
+def _gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
     """Return an Adam that updates a tensor on a GPU in one kernel."""
     if not sparse:
         return torch.optim.Adam([param], lr=rate, eps=ADAM_EPS, fused=True)
@@ -269,34 +274,3 @@ def gpu_adam(param: Tensor, rate: float, sparse: bool) -> torch.optim.Optimizer:
     optimizer: torch.optim.Optimizer = SelectiveAdam([param], eps=ADAM_EPS, betas=(0.9, 0.999))
     optimizer.param_groups[0]["lr"] = rate  # its constructor takes none
     return optimizer
-
-
-@torch.no_grad()
-def fused_steps(optimizers: Sequence[torch.optim.Adam], views: int = 1) -> None:
-    """Make one step of each optimizer with the bits of its own `step`, in less processor time.
-
-    Args:
-        optimizers: of `gpu_adam`: fused, with one tensor each.
-        views: of a `StepScale`.
-    """
-    started = []
-    for optimizer in optimizers:
-        group = optimizer.param_groups[0]
-        param = group["params"][0]
-        if param.grad is None:
-            continue
-        state = optimizer.state[param]
-        if not state:  # as `step` makes them
-            state["step"] = torch.zeros((), device=param.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
-        started.append((group, param, state))
-    if started:
-        torch._foreach_add_([state["step"] for _, _, state in started], views)
-    for group, param, state in started:
-        beta1, beta2 = (beta**views for beta in group["betas"])
-        # The kernel raises these betas to the power of the count, which has to be one of steps instead of views.
-        count = state["step"] if views == 1 else state["step"] / views
-        torch._fused_adam_(
-            [param], [param.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [count],
-            lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=0.0, eps=group["eps"], amsgrad=False, maximize=False,
-        )  # fmt: skip

@@ -14,12 +14,11 @@ import torch
 from gsplat.strategy.ops import duplicate, remove, split
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.training.densification import Densifier, ViewScores
+from lapgs_plugin.training.densification import Densifier, ViewScores, required
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Multiview
@@ -114,15 +113,11 @@ class MultiviewDensifier(Densifier):
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of absolute gradients, too; see `DensityControl`."""
         super().accumulate(result, camera)
-        if result.absgrad2d is None:
-            raise UserInputError(
-                "--strategy multiview needs the RenderResult's absgrad2d, which this rasterizer leaves empty; choose "
-                "--strategy mcmc, which needs none, or another --rasterizer"
-            )
+        gradient = required(result.absgrad2d, "absgrad2d")
         if self.state["absgrad2d"] is None:
             self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
         size = camera.width, camera.height
-        add_statistics(result.absgrad2d, result.radii, size, self.state["absgrad2d"], self.state["shown"])
+        add_statistics(gradient, result.radii, size, self.state["absgrad2d"], self.state["shown"])
 
     @torch.no_grad()
     def _refine(

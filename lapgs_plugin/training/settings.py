@@ -38,9 +38,6 @@ LAST, BEST = "last", "best"
 ON, OFF = "on", "off"
 """Choices of --exposure, beside auto."""
 
-ANTIALIASING = "antialiasing"
-"""Key of `TrainSettings.raster` for rasterizers and manifests."""
-
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
 
@@ -352,11 +349,6 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--views-per-step {views}: expected auto, or at least 1")
         return views
 
-    @property
-    def raster(self) -> dict[str, Any]:
-        """Settings of the rasterizer that change images, for the manifest."""
-        return {ANTIALIASING: True} if self.antialiased else {}
-
     def strategy_of(self, stage: Stage, pixels: int) -> Strategy:
         """Return the strategy of density control with the options of a stage and the pixels of its training images."""
         part = StagePart(self.threshold_factor(stage), pixels, base=self._is_base(stage.level), finest=stage.level == 0)
@@ -416,7 +408,8 @@ class TrainSettings(HierarchySettings):
 
     def for_manifest(self) -> dict[str, Any]:
         """Return the settings as arguments of `Manifest`: its own fields by name, the others in "settings"."""
-        values = {**self.resolved(), "raster": self.raster}
+        # What rendering the run needs to know of the rasterizer, as `rasterizers.choice` reads it.
+        values = {**self.resolved(), "raster": {"antialiasing": True} if self.antialiased else {}}
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError
+from lapgs_plugin.errors import LapgsError, RunFolderError, SceneError, counted
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
@@ -99,7 +99,7 @@ class FollowedRun:
         if self.problem is not None:
             return f"{self.problem}; showing level {levels} of {manifest.levels}"
         if manifest.complete:
-            return f"{self._folder.name}: {manifest.levels} levels"
+            return f"{self._folder.name}: {counted(manifest.levels, 'level')}"
         return f"{self._folder.name} is not complete: showing level {levels} of {manifest.levels}; others will follow"
 
     def _read(self) -> None:

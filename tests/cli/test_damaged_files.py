@@ -65,54 +65,29 @@ def change(path: Path, where: str, value: Any) -> None:
 
 MANIFEST_DAMAGE: list[tuple[str, Any, str]] = [
     ("settings", [], "expected an object"),
-    ("settings", "x", "expected an object"),
     ("settings.iterations", "300", "expected a valid integer"),
     ("settings.iterations", 0, "expected greater than 0"),
     ("settings.hierarchy", "flat", "expected 'nested' or 'laplacian'"),
-    ("settings.clamped", "no", "expected a valid boolean"),
-    ("settings.raster", [], "expected an object"),
     ("settings.raster", {"mult": "big"}, "expected"),
-    ("scene", None, "expected an object"),
     ("scene.path", 5, "expected a valid string"),
     ("scene.path", "a\0b", "is no path"),
-    ("scene.path", "a" * 300, "is no path"),
-    ("scene.images", ["a"], "expected a valid string"),
     ("scene.eval", 1, "expected a valid boolean"),
-    ("scene.background", "black", "expected a valid array"),
     ("scene.background", [0, 0], "it lacks scene.background.2."),
-    ("scene.background[1]", "0", "expected a valid number"),
     ("scene.background[1]", -1, "expected greater than or equal to 0"),
-    ("scene.background[1]", None, "expected a valid number"),
     ("levels", 1_000_000_000, "expected 1 to 24"),
     ("levels", 10**25, "expected 64 bits at most"),
-    ("levels", -1, "expected 1 to 24"),
     ("levels", 0, "expected 1 to 24"),
-    ("levels", 2.5, "expected a valid integer"),
-    ("levels", None, "expected a valid integer"),
-    ("levels", True, "expected a valid integer"),
     ("grid", "x", "'x' is no pixel grid, expected camera or even"),
     ("sh_degree", 9, "expected less than or equal to 3"),
     ("seed", -1, "expected greater than or equal to 0"),
-    ("rasterizer", None, "expected a valid string"),
-    ("created", 5, "expected a valid string"),
     ("records", {}, "expected a valid array"),
-    ("records", "x", "expected a valid array"),
-    ("records[0]", None, "expected an object"),
-    ("records[0].level", "1", "expected a valid integer"),
     ("records[0].level", 7, "finished levels .7, 0., expected .1, 0."),
-    ("records[0].signed", 0, "expected a valid boolean"),
     ("records[0].iterations", 0, "expected greater than 0"),
-    ("records[0].num_gaussians", -5, "expected greater than or equal to 0"),
     ("records[0].num_gaussians", 10**18, "holds 250 Gaussians, the manifest says 1000000000000000000"),
     ("records[0].train_seconds", "long", "expected a valid number"),
-    ("records[0].train_seconds", -1.0, "expected greater than or equal to 0"),
-    ("records[0].overhead_seconds", 3, "expected an object"),
     ("records[0].overhead_seconds", {"pyramid": "x"}, "expected a valid number"),
     ("records[0].image_size", [56], r"it lacks records\[0\]\.image_size\[1\]"),
-    ("records[0].image_size", [56, 0], "expected greater than 0"),
     ("records[0].memory_bytes", {"peak": 1}, "expected peak and images"),
-    ("records[0].mean_gaussians", "many", "expected a valid number"),
-    ("records[0].breakdown_seconds", [], "expected an object"),
 ]
 
 
@@ -131,17 +106,8 @@ def test_values_of_a_manifest(run: Path, where: str, value: Any, message: str) -
     assert files_in(run) | {".lock"} == before | {".lock"}
 
 
-WHOLE_FILES = [
-    b"",
-    b"{",
-    b"[]",
-    b"null",
-    b"5",
-    b"[" * 200_000,
-    b"1" * 5_000,
-    b'{"levels": ' + b"9" * 5_000 + b"}",
-    b"\xff",
-]
+WHOLE_FILES = [b"", b"[]", b"[" * 200_000, b"\xff"]
+"""`test_untrusted` has more."""
 
 
 @pytest.mark.parametrize("contents", WHOLE_FILES, ids=range(len(WHOLE_FILES)))

@@ -30,17 +30,22 @@ app.command()(doctor)
 
 
 @pytest.fixture(autouse=True)
-def _probed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def _probed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And in an empty folder, because the files of the current one are read."""
     monkeypatch.setattr(probes, "run_probe", probed)
+    monkeypatch.chdir(tmp_path)
 
 
-def test_json_names_every_section_and_this_machine_can_train() -> None:
+def test_json_names_every_section_and_this_machine_can_train(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(CHECKOUTS / "fastgs")
     result = CliRunner().invoke(app, ["--json"])
     assert result.exit_code == 0
     sections = json.loads(result.stdout)
     assert {"System", "PyTorch", "Compilers", "CPU rasterizer", "Packages", "Backbones"} <= sections.keys()
     assert sections["lapgs train"][0]["status"] == "ok"
     assert "CPU rasterizer" in sections["lapgs train"][0]["detail"]
+    assert sections["Backbones"][-1]["name"] == "Current folder"
+    assert "FastGS" in sections["Backbones"][-1]["detail"]
     for found in sections.values():
         for finding in found:
             assert finding["status"] in ("ok", "absent", "problem")
@@ -111,18 +116,10 @@ def test_what_training_will_use(
     assert ("--rasterizer cpu" in conclusion.advice) == (status == "problem")
 
 
-def test_the_current_folder_is_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_current_folder_is_a_checkout() -> None:
     for folder, message in (
         ("fastgs", "a checkout of FastGS or a fork of it; `lapgs run train.py ...` trains it on the"),
+        ("mini", "a checkout of Mini-Splatting or a fork of it; `lapgs run ms/train.py ..."),
         ("", "not a"),
     ):
-        monkeypatch.chdir(CHECKOUTS / folder)
-        found = json.loads(CliRunner().invoke(app, ["--json"]).stdout)["Backbones"][-1]
-        assert found["name"] == "Current folder"
-        assert found["detail"].startswith(message)
-
-
-def test_the_script_of_the_current_folder_may_be_below_it() -> None:
-    assert (
-        "Mini-Splatting or a fork of it; `lapgs run ms/train.py ..." in current_folder(CHECKOUTS / "mini", False).detail
-    )
+        assert current_folder(CHECKOUTS / folder, has_gpu=False).detail.startswith(message)

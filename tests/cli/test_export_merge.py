@@ -51,7 +51,7 @@ def test_the_merged_field_keeps_most_of_the_image(tmp_path: Path) -> None:
         r"([0-9.]+) dB PSNR .* of (\d+) views .* photos ([0-9.]+) dB, where the run has ([0-9.]+)", output
     )[0]
     assert int(views) == 2
-    assert float(kept) == pytest.approx(_kept(run, merged), abs=0.01)
+    assert float(kept) == pytest.approx(_kept(run, merged), abs=0.01)  # 0.0014 seen
     archive = RunArchive.open(run)
     started = _kept(run, first_field({level: archive.field(level) for level in (1, 0)}))
     assert float(kept) > started + 2  # seen 3.1
@@ -68,7 +68,7 @@ def test_a_run_that_compensates_exposure_is_compared_with_photos_after_a_colour_
     archive = RunArchive.open(run)
     renderer, photos = run_renderer(archive), run_scene(archive).test
     fitted = [color_fitted_psnr(renderer.images([view.camera], 0)[0].cpu(), view.image) for view in photos]
-    assert float(before) == pytest.approx(fmean(fitted), abs=0.01)
+    assert float(before) == pytest.approx(fmean(fitted), abs=0.01)  # 3.8e-4 seen
 
 
 def test_an_antialiased_run_is_merged_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

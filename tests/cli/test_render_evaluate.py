@@ -43,7 +43,7 @@ def test_render_writes_every_image_of_the_held_out_views(run: Path) -> None:
 
 def test_the_log_says_which_rasterizer_renders(run: Path, caplog: pytest.LogCaptureFixture) -> None:
     lapgs("render", run, "--level", "1")
-    assert "rendering with cpu on" in caplog.text
+    assert "rendering with the CPU rasterizer: " in caplog.text
 
 
 def test_exr_files_add_up_and_png_files_show_them(run: Path) -> None:
@@ -286,7 +286,7 @@ def test_what_is_left_of_a_damaged_run_can_be_rendered(run: Path, damage: str) -
 def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:
     before = files_in(run)
     printed = lapgs("render", run, "--fps")
-    assert "median over 2 cameras" in printed
+    assert "medians over 2 cameras" in printed
     for words in (("levels 1 to 0, one after the other", "450"), ("base", "250"), ("residual 0 alone", "200")):
         assert any(all(word in line for word in words) for line in printed.splitlines()), words
     assert "100x60" in lapgs("render", run, "--fps", "--size", "100x60")

@@ -29,7 +29,8 @@ from tests.waiting import wait_for
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-LOCK_TIMEOUT = 120.0
+TIMEOUT = 600.0
+"""Seconds until a process counts as stuck; a busy machine takes a hundred times as long as an idle one."""
 
 READY = "installed"
 """What a process prints as soon as its handlers are there; before, the interpreter starts and Ctrl-C is its own."""
@@ -96,7 +97,7 @@ def signalled(
             process.send_signal(which)
             begin = begin if number else time.monotonic()
     try:
-        text, _ = process.communicate(timeout=LOCK_TIMEOUT)
+        text, _ = process.communicate(timeout=TIMEOUT)
     finally:
         process.kill()
     return Ended(process.returncode, text, time.monotonic() - begin)
@@ -132,7 +133,7 @@ def has_written(out: Path, pattern: str = "*") -> Callable[[subprocess.Popen[str
     """Return a function that waits until a command has written a file below a folder."""
 
     def wait(process: subprocess.Popen[str]) -> None:
-        wait_for(lambda: process.poll() is not None or any(map(Path.is_file, out.rglob(pattern))), LOCK_TIMEOUT)
+        wait_for(lambda: process.poll() is not None or any(map(Path.is_file, out.rglob(pattern))), TIMEOUT)
 
     return wait
 
@@ -251,13 +252,13 @@ press = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM) or t
 with interrupt.command():
     press()  # ctypes cannot pass on what is raised in a callback
     time.sleep(30)
+    print("nothing was raised")
 """
 
 
 def test_an_interruption_that_a_callback_loses_is_raised_again() -> None:
-    begin = time.monotonic()
     done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, check=False)
-    assert time.monotonic() - begin < 25
+    assert done.stdout == ""
     assert done.returncode == 143
     assert done.stderr == "lapgs: stopped by SIGTERM\n"
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,7 +22,6 @@ from lapgs_plugin.viewer.preview import read_preview
 from tests.cli.run_folder import write_run, write_scene
 
 SHORT = ("--iterations", "40", "--sh-degree", "1")
-RESIDUALS = ("--hierarchy", "laplacian")
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +56,14 @@ def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_run_trains_and_a_second_one_into_it_is_refused(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
-    done = lapgs("train", scene, "-o", tmp_path / "run", "--eval", "--views-per-step", "3", *SHORT)
+    options = ("--eval", "--views-per-step", "3", "--joint", "0.25", "--inherit", "xyz:0.5", *SHORT)
+    done = lapgs("train", scene, "-o", tmp_path / "run", *options)
     assert done.returncode == 0, done.stderr
     archive = RunArchive.open(tmp_path / "run")
     assert archive.manifest.complete
     assert archive.manifest.settings["views_per_step"] == "3"
     assert archive.manifest.settings["hierarchy"] == "laplacian", "unless told otherwise"
+    assert (archive.manifest.inherit, archive.manifest.settings["joint"]) == ("xyz:0.5", 0.25)
     assert [record.signed for record in archive.manifest.records] == [False, True]
     assert read_preview(tmp_path / "run") is not None
     before = archive.field_path(0).read_bytes()
@@ -127,15 +127,6 @@ def test_another_scene_does_not_continue_a_run_and_one_that_moved_does(lapgs: La
     assert {path: path.read_bytes() for path in files} == files
 
 
-def test_residuals_are_trained_on_request(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
-    options = (*RESIDUALS, "--joint", "0.25", "--inherit", "xyz:0.5", "--supervision", "reconstructed")
-    done = lapgs("train", scene, "-o", tmp_path / "run", *options, *SHORT)
-    assert done.returncode == 0, done.stderr
-    manifest = RunArchive.open(tmp_path / "run").manifest
-    assert [record.signed for record in manifest.records] == [False, True]
-    assert (manifest.inherit, manifest.settings["joint"]) == ("xyz:0.5", 0.25)
-
-
 @pytest.mark.slow
 def test_runs_from_before_nesting_continue_with_residuals(lapgs: Lapgs, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), finished=1)
@@ -155,23 +146,26 @@ def test_runs_from_before_nesting_continue_with_residuals(lapgs: Lapgs, tmp_path
     assert [record.signed for record in RunArchive.open(run).manifest.records] == [False, True]
 
 
-def test_ctrl_c_leaves_a_run_that_resumes_to_the_same_bits(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
-    options = (scene, "--iterations", "300", "--sh-degree", "1", "--densify-every", "50")
-    assert lapgs("train", *options, "-o", tmp_path / "whole").returncode == 0
-    command = [sys.executable, "-c", "from lapgs_plugin.cli import main; main()", "train", *map(str, options)]
-    with subprocess.Popen([*command, "-o", tmp_path / "parts"], stderr=subprocess.PIPE, text=True) as process:
-        history = tmp_path / "parts" / "history.jsonl"
-        deadline = time.monotonic() + 60
-        while not (history.exists() and history.stat().st_size > 0) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
-    assert "--resume continues" in errors.replace("\n", " ")
-    other = lapgs("train", scene, "-o", tmp_path / "parts", "--resume", "--iterations", "500")
+def test_ctrl_c_leaves_a_run_that_resumes(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lapgs: Lapgs
+) -> None:
+    """`test_training` compares bits, `test_signals` presses Ctrl-C in another process."""
+    options, run = (scene, *SHORT), tmp_path / "run"
+    append, entries = RunArchive.append_history, []
+
+    def append_and_press(archive: RunArchive, entry: dict[str, Any]) -> None:
+        append(archive, entry)
+        entries.append(entry)
+        if len(entries) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunArchive, "append_history", append_and_press)
+        stopped = lapgs("train", *options, "-o", run)
+    assert stopped.returncode == 130
+    assert "--resume continues" in stopped.stderr.replace("\n", " ")
+    other = lapgs("train", scene, "-o", run, "--resume", "--iterations", "500")
     assert other.returncode == 2
     assert "--iterations asks for 500" in other.stderr
-    assert lapgs("train", *options, "-o", tmp_path / "parts", "--resume").returncode == 0
-    whole, parts = RunArchive.open(tmp_path / "whole"), RunArchive.open(tmp_path / "parts")
-    for level in (1, 0):
-        assert whole.field_path(level).read_bytes() == parts.field_path(level).read_bytes()
+    assert lapgs("train", *options, "-o", run, "--resume").returncode == 0
+    assert RunArchive.open(run).manifest.complete

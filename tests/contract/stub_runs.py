@@ -25,6 +25,7 @@ from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 from lapgs_plugin.checkouts.script import loaded_script
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rendering.run import run_renderer, run_scene
@@ -53,6 +54,8 @@ THIRDS: dict[str, Any] = {"split": "1/3,2/3"}
 """Option for stages of 30 and 60 iterations, the default of these tests for residuals."""
 KINDS = ("nested", "laplacian")
 """Both kinds of hierarchy."""
+SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
+"""Options of the session's bare runs, see `conftest.bare_run`."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ STUBS = {
     )
 }
 NAMES = tuple(STUBS)
+STUBS_AND_KINDS = (("fastgs", "laplacian"), ("taming", "nested"), ("graphdeco", "laplacian"), ("graphdeco", "nested"))
+"""Every stub and both kinds of hierarchy, for what all stubs share."""
 
 FORKS = {
     stub.name: stub
@@ -113,6 +118,18 @@ FORKS = {
     )
 }
 """Forks whose adapters have a policy of their own."""
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the files' contents by name, with the folder's own name replaced.
+
+    TensorBoard's log, if it is installed, has another name each time, and only a recorded run has a record.
+    """
+    found = sorted(path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
+    name = str(folder).encode()
+    contents = {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
+    contents.pop(BARE_RECORD, None)
+    return contents
 
 
 @dataclass(frozen=True)

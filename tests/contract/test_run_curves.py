@@ -10,7 +10,7 @@ from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
-from tests.contract.stub_runs import KINDS, NAMES, SHORT, STUBS, THIRDS, run_hierarchy
+from tests.contract.stub_runs import SHORT, STUBS, STUBS_AND_KINDS, THIRDS, run_hierarchy
 
 OFTEN = ("--densify_from_iter", 0, "--densification_interval", 3, "--densify_until_iter", 30)
 EVERY = 4
@@ -28,7 +28,7 @@ def rendered(archive: RunArchive, level: int) -> float:
 
 @pytest.mark.parametrize(
     ("name", "hierarchy", "supervision"),
-    [*((name, kind, "reconstructed") for name in NAMES for kind in KINDS), ("graphdeco", "laplacian", "gt_laplacian")],
+    [*((*pair, "reconstructed") for pair in STUBS_AND_KINDS), ("graphdeco", "laplacian", "gt_laplacian")],
 )
 def test_curves_leave_no_trace(scene: Path, tmp_path: Path, name: str, hierarchy: str, supervision: str) -> None:
     runs = {}

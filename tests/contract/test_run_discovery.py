@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from argparse import Namespace
 from contextlib import nullcontext
 from pathlib import Path
@@ -59,6 +60,24 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
     assert {"antialiasing", "viewmatrix"} < use.settings
     assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
     stand_in_is_refused(fork, f"no CPU stand-in for {OTHER}, imported in gaussian_renderer/__init__.py:")
+
+
+def test_two_rasterizers_of_one_name_are_each_replaced_once(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in Perceptual-GS: wrapped twice, a residual would be composed twice."""
+    other = ModuleType(OTHER)
+    vars(other)["GaussianRasterizer"] = type("GaussianRasterizer", (), {})
+    monkeypatch.setitem(sys.modules, OTHER, other)
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    with (checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py").open("a") as file:
+        file.write(f"\n\ndef scores():\n    from {OTHER} import GaussianRasterizer\n    return GaussianRasterizer()\n")
+    with loaded(STUBS["graphdeco"], scene, tmp_path, script=checkouts / "graphdeco" / "train.py") as adapter:
+        places = {
+            each.use.module: [owner.__name__ for owner, _ in adapter.profile.places(each, "GaussianRasterizer")]
+            for each in adapter.profile.rasterizers
+        }
+    assert places == {MODULE: ["gaussian_renderer"], OTHER: [OTHER]}
 
 
 def test_a_rasterizer_that_is_not_installed_is_the_checkouts_own(fork: Path) -> None:

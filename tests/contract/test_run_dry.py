@@ -145,19 +145,24 @@ def test_an_evaluation_that_fails_costs_no_run(
     assert "held-out views of level 0 could not be measured (RuntimeError: no image); " in warning
 
 
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
 def test_what_is_rendered_has_to_be_what_is_archived(
-    hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    hierarchy: str, late: bool, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As of forks whose renderers apply a filter or a mask to the parameters of their models."""
+    """As of forks whose renderers apply a filter or a mask to the parameters of their models, or quantize them late."""
     checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
     renderer = checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py"
     text = renderer.read_text(encoding="utf-8")
     for name in ("get_scaling,", "get_opacity,"):
         assert text.count(name) == 1
-        text = text.replace(name, f"{name[:-1]} * 0.98,")
+        text = text.replace(name, f"{name[:-1]} * (0.98 if getattr(pc, 'late', {not late}) else 1),")
     renderer.write_text(text, encoding="utf-8")
     script, signed = checkouts / "graphdeco" / "train.py", hierarchy == "laplacian"
+    if late:
+        text, call = script.read_text(encoding="utf-8"), "        gaussians.update_learning_rate(iteration)\n"
+        assert text.count(call) == 1
+        script.write_text(text.replace(call, f"{call}        gaussians.late = iteration > 2\n"), encoding="utf-8")
     message = r"scene/gaussian_model.py:\d+: the checkout renders other scales and opacities than its model has as par"
     refused = pytest.raises(UserInputError, match=f"{message}.* --hierarchy nested") if signed else nullcontext()
     with (
@@ -168,7 +173,9 @@ def test_what_is_rendered_has_to_be_what_is_archived(
         drive(adapter, dry_run=True, hierarchy=hierarchy)
     warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
     assert [bool(re.match(message, each)) for each in warnings] == ([] if signed else [True])
-    assert (tmp_path / "run").exists() != signed
+    assert (tmp_path / "run").exists() == (late or not signed)
+    if late and signed:
+        assert RunArchive.open(tmp_path / "run").available_levels == (1,)
 
 
 def test_what_a_renderer_does_in_training_alone_is_left_out_of_predictions_and_measurements(

@@ -99,8 +99,9 @@ def test_a_run_with_released_opacities_is_archived(scene: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp_path: Path) -> None:
+def test_full_inheritance_takes_colours_and_optimizers_along(name: str, scene: Path, tmp_path: Path) -> None:
     moments: list[dict[str, Tensor]] = []
+    values: list[dict[str, Tensor]] = []
     with loaded(STUBS[name], scene, tmp_path / "run", "--quiet") as adapter:
         model = adapter.train.GaussianModel
         # Every model begins an iteration here: the last state of the base, and the first one of the residual.
@@ -109,6 +110,7 @@ def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp
         def spy(self: Any, iteration: int) -> Any:
             if iteration in (1, 30):
                 state = self.optimizer.state
+                values.append({g["name"]: p.detach().clone() for g, p in parameters(self)})
                 moments.append({g["name"]: state[p]["exp_avg"].clone() for g, p in parameters(self) if p in state})
             return update(self, iteration)
 
@@ -120,6 +122,8 @@ def test_full_inheritance_takes_the_optimizers_along(name: str, scene: Path, tmp
     for group in base:
         # The last iteration of a stage takes no step, and here it does not densify either.
         assert torch.equal(base[group], residual[group]), group
+    assert values[1].keys() == values[2].keys()
+    assert all(torch.equal(value, values[2][group]) for group, value in values[1].items())
 
 
 def parameters(model: Any) -> list[tuple[dict[str, Any], Tensor]]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
-from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
+from lapgs_plugin.errors import FieldError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
@@ -24,10 +24,10 @@ from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
+    SHORT,
     STUBS,
     Seeded,
     StopAt,
@@ -37,7 +37,7 @@ from tests.contract.stub_runs import (
     loaded,
     run_residuals,
 )
-from tests.mishaps import FailAfterStage, FailingWrites, Killed, disk_full
+from tests.mishaps import FailAfterStage, FailingWrites, Killed
 from tests.training_runs import plys
 
 
@@ -100,7 +100,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 def test_without_a_share_they_stay_as_they_are(options: dict[str, Any], scene: Path, tmp_path: Path) -> None:
     """There is no joint training for less than an iteration, or where residuals are supervised alone."""
     before = FieldsAt(tmp_path / "run")
-    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before,), **options)
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, hooks=(before,), **options)
     for part, value in archive.field(1).parameters.items():
         assert torch.equal(before.fields[1][part], value)
 
@@ -129,14 +129,6 @@ def test_finished_fields_follow_optimizers_that_a_loop_makes_in_the_middle(
     assert len(steps) == 9, "in iterations 11 to 19; after its last the checkout does not step"
 
 
-@pytest.fixture(scope="module")
-def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a scene for three levels with odd sizes at the second."""
-    path = tmp_path_factory.mktemp("odd") / "scene"
-    make_sample_scene(path, width=96, height=66, views=12, points=300, progress=False)
-    return path
-
-
 class Inspected:
     """Inspect joint levels when they begin to follow a stage, in place of `JointLevels.follow`."""
 
@@ -151,7 +143,7 @@ class Inspected:
         monkeypatch.setattr(JointLevels, "follow", follow)
 
 
-def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_predictions_are_up_of_the_archived_levels(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Predictions before the first joint step are those of the archived fields, rendered without the checkout's code.
 
     The cached predictions are dropped by then.
@@ -163,7 +155,7 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
         assert len(kept.store) == 0
         renderer = run_renderer(RunArchive.open(tmp_path / "run"), device="cpu", rasterizer="cpu")
         found = []
-        for view in load_scene(odd, progress=False).train[:3]:
+        for view in load_scene(big, progress=False).train[:3]:
             (key,) = [key for key in levels._views.cameras if Path(view_name(key)).stem == Path(view.name).stem]
             image = levels.get(key)
             level = min(renderer.fields)
@@ -175,14 +167,14 @@ def test_predictions_are_up_of_the_archived_levels(odd: Path, tmp_path: Path, mo
         return found
 
     inspected = Inspected(monkeypatch, differences)
-    run_residuals(STUBS["graphdeco"], odd, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
+    run_residuals(STUBS["graphdeco"], big, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
     assert [len(found) for found in inspected.results] == [3, 3], "two residual stages"
     assert max(max(found) for found in inspected.results) < 5e-6  # 1.8e-7 seen
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_every_finished_field(
-    name: str, odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gradients by colour of a weighted sum of the composed image, linear in colours, equal differences."""
 
@@ -207,7 +199,7 @@ def test_gradients_reach_every_finished_field(
 
     inspected = Inspected(monkeypatch, relative_errors)
     options = ("--iterations", 60) if name == "taming" else ("--iterations", 12)
-    run_residuals(STUBS[name], odd, tmp_path / "run", *options, levels=3, joint=0.5)
+    run_residuals(STUBS[name], big, tmp_path / "run", *options, levels=3, joint=0.5)
     assert [len(errors) for errors in inspected.results] == [1, 2]
     assert max(max(errors) for errors in inspected.results) < 2e-3  # 1.9e-4 seen: dark colours of the base are clamped
 
@@ -252,12 +244,11 @@ def test_parameters_of_a_forks_own_are_not_followed(scene: Path, tmp_path: Path)
     assert RunArchive.open(folder).manifest.complete
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_photos_are_matched_better(name: str, scene: Path, tmp_path: Path) -> None:
+def test_photos_are_matched_better(scene: Path, tmp_path: Path) -> None:
     """Joint training reduces the error of the training views."""
     errors = {}
     for share in (0.0, 0.5):
-        archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), joint=share)
+        archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / str(share), joint=share)
         renderer = run_renderer(archive, device="cpu", rasterizer="cpu")
         views = load_scene(scene, eval=True, progress=False).train
         squares = [(renderer.render(view.camera).composed[0] - view.image).square().mean() for view in views]
@@ -282,19 +273,16 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
         assert torch.equal(before.fields[1][part], value)
 
 
-def three_levels(
-    scene: Path, folder: Path, *hooks: StageHook, name: str = "graphdeco", resume: bool = True
-) -> RunArchive:
+def three_levels(scene: Path, folder: Path, *hooks: StageHook, resume: bool = True) -> RunArchive:
     """Run three short stages, half of the last two joint.
 
     Predictions are float32: a resumed run makes them again level by level, which would round once more in float16.
     """
-    iterations = 60 if name == "taming" else 12
     archive, _ = run_residuals(
-        STUBS[name],
+        STUBS["graphdeco"],
         scene,
         folder,
-        *("--iterations", iterations),
+        *("--iterations", 12),
         levels=3,
         joint=0.5,
         prediction_precision="float32",
@@ -304,20 +292,20 @@ def three_levels(
     return archive
 
 
-def two_finished(scene: Path, folder: Path, name: str = "graphdeco") -> Path:
+def two_finished(scene: Path, folder: Path) -> Path:
     """Run it without its last stage."""
     with captured(folder, []), pytest.raises(KeyboardInterrupt):
-        three_levels(scene, folder, StopAt(0), name=name, resume=False)
+        three_levels(scene, folder, StopAt(0), resume=False)
     return folder
 
 
 @pytest.mark.slow
 def test_a_run_killed_while_it_archives_them_ends_as_others(
-    odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run is killed at any write after the last stage, and resumed."""
-    whole = three_levels(odd, tmp_path / "whole", resume=False)
-    begun = two_finished(odd, tmp_path / "begun")
+    whole = three_levels(big, tmp_path / "whole", resume=False)
+    begun = two_finished(big, tmp_path / "begun")
     base = plys(RunArchive.open(begun))
     assert all(before != after for before, after in zip(base, plys(whole)[:2], strict=True)), "they were trained along"
     writes = FailingWrites(monkeypatch, Killed)
@@ -325,35 +313,20 @@ def test_a_run_killed_while_it_archives_them_ends_as_others(
     while not done:
         folder = shutil.copytree(begun, tmp_path / str(left))
         with contextlib.suppress(Killed), captured(folder, []):
-            three_levels(odd, folder, FailAfterStage(writes, 0, left))
+            three_levels(big, folder, FailAfterStage(writes, 0, left))
             done = True
         writes.left = sys.maxsize
         killed = RunArchive.open(folder)
         assert plys(killed) == (plys(whole) if killed.manifest.complete else base)
-        assert plys(three_levels(odd, folder)) == plys(whole)
+        assert plys(three_levels(big, folder)) == plys(whole)
         assert {path.name for path in folder.glob("level_*/*.ply")} == {"input.ply", "point_cloud.ply"}
         left += 1
     # The manifest is written again when the held-out views are measured.
     assert left == 18, "three PLYs and two manifests in three steps each, two renamings, and a run that went well"
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_disk_that_is_full_when_a_stage_ends_leaves_what_was_finished(
-    name: str, odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = three_levels(odd, tmp_path / "whole", name=name, resume=False)
-    folder = two_finished(odd, tmp_path / "run", name)
-    before = plys(RunArchive.open(folder))
-    writes = FailingWrites(monkeypatch, disk_full)
-    with captured(folder, []), pytest.raises(RunFolderError, match=r"No space left.*what was finished .* is unharmed"):
-        three_levels(odd, folder, FailAfterStage(writes, 0, 4), name=name)  # in the second PLY
-    writes.left = sys.maxsize
-    assert plys(RunArchive.open(folder)) == before
-    assert plys(three_levels(odd, folder, name=name)) == plys(whole)
-
-
-def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = two_finished(odd, tmp_path / "run")
+def test_nan_in_one_of_them_leaves_all_as_they_were(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = two_finished(big, tmp_path / "run")
     before = plys(RunArchive.open(folder))
     original = JointLevels.fields
 
@@ -364,7 +337,7 @@ def test_nan_in_one_of_them_leaves_all_as_they_were(odd: Path, tmp_path: Path, m
 
     monkeypatch.setattr(JointLevels, "fields", poisoned)
     with captured(folder, []), pytest.raises(FieldError, match="level 1: x is NaN or inf for 1 of"):
-        three_levels(odd, folder)
+        three_levels(big, folder)
     assert plys(RunArchive.open(folder)) == before
 
 

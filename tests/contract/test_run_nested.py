@@ -28,7 +28,6 @@ from lapgs_plugin.runner import driver
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import (
     CHECKOUTS,
     KINDS,
@@ -367,9 +366,8 @@ def test_tamings_budget_is_the_whole_runs(run_of: Callable[[str], tuple[RunArchi
     assert 600 < coarse < fine <= 1200
 
 
-def test_three_levels(tmp_path: Path) -> None:
-    make_sample_scene(tmp_path / "big", width=96, height=66, views=12, points=300, progress=False)
-    archive, _ = run_hierarchy(STUBS["fastgs"], tmp_path / "big", tmp_path / "run", "--iterations", 60, levels=3)
+def test_three_levels(big: Path, tmp_path: Path) -> None:
+    archive, _ = run_hierarchy(STUBS["fastgs"], big, tmp_path / "run", "--iterations", 12, levels=3)
     assert [(r.level, r.signed) for r in archive.manifest.records] == [(2, False), (1, False), (0, False)]
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from torch import Tensor
 from typer.testing import CliRunner
 
 from lapgs_plugin.cli.app import app
@@ -23,17 +25,15 @@ from tests.contract.stub_runs import (
     CHECKOUTS,
     ITERATIONS,
     NAMES,
+    SAVING,
     STUBS,
     Result,
     arguments,
     captured,
+    files,
     loaded,
-    run_bare,
     without,
 )
-
-SAVING = ("--save_iterations", 40, "--checkpoint_iterations", 40)
-
 
 PROFILED = 0.5
 """Seconds of kernels that the stand-in of a GPU's profile finds each time."""
@@ -51,17 +51,11 @@ def record(name: str, scene: Path, folder: Path) -> Result:
     return results[0]
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    # The name of TensorBoard's log, if it is installed, is another one each time.
-    own = (path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
-    found = sorted(path for path in own if path.name != BARE_RECORD)
-    name = str(folder).encode()
-    return {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_a_recorded_run_is_the_bare_run_to_the_bit(name: str, scene: Path, tmp_path: Path) -> None:
-    bare = run_bare(STUBS[name], scene, tmp_path / "bare", *SAVING)
+def test_a_recorded_run_is_the_bare_run_to_the_bit(
+    name: str, bare_run: Callable[[str], tuple[Result, Tensor]], scene: Path, tmp_path: Path
+) -> None:
+    bare, _ = bare_run(name)
     start = time.perf_counter()
     recorded = record(name, scene, tmp_path / "recorded")
     wall = time.perf_counter() - start

@@ -19,9 +19,10 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from tests.contract.stub_runs import (
     CHECKOUTS,
-    KINDS,
     NAMES,
+    SHORT,
     STUBS,
+    STUBS_AND_KINDS,
     THIRDS,
     captured,
     drive,
@@ -210,12 +211,12 @@ PUBLISHED = "iteration % 3000 == 0 and iteration > 15_000 and iteration < 30_000
 
 def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict[str, list[tuple[int, int]]]:
     """Collect (iterations of the stage, iteration) of calls of FastGS's model. Its training function's numbers for
-    30,000 iterations are divided by 50."""
+    30,000 iterations are divided by 100."""
     checkouts = Path(shutil.copytree(CHECKOUTS, folder / "checkouts", ignore=shutil.ignore_patterns("__pycache__")))
     script = checkouts / "fastgs" / "train.py"
     text = script.read_text(encoding="utf-8")
     assert PUBLISHED in text
-    script.write_text(text.replace(PUBLISHED, "iteration % 60 == 0 and iteration > 300 and iteration < 600"))
+    script.write_text(text.replace(PUBLISHED, "iteration % 30 == 0 and iteration > 150 and iteration < 300"))
     found: dict[str, list[tuple[int, int]]] = {"prune": [], "step": [], "sh_step": []}
     with captured(folder, []), loaded(STUBS["fastgs"], scene, folder / "run", *more, script=script) as adapter:
         model = adapter.train.GaussianModel
@@ -246,18 +247,18 @@ def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict
 def test_numbers_in_the_training_function_keep_their_share_of_each_residual_stage(scene: Path, tmp_path: Path) -> None:
     """FastGS prunes late at 18,000, 21,000, 24,000 and 27,000 of 30,000 iterations. The numbers of its optimizer, which
     are in another file, stay: all iterations until 15,000 step, higher SH every 16th. A stage's last does not."""
-    more = ("--iterations", 600, "--densify_until_iter", 36, "--sh_degree", 0)
+    more = ("--iterations", 300, "--densify_until_iter", 36, "--sh_degree", 0)
     found = record_fastgs(scene, tmp_path, *more, hierarchy="laplacian", joint=0.0, **THIRDS)
-    assert found["prune"] == [*((200, i) for i in (120, 140, 160, 180)), *((400, i) for i in (240, 280, 320, 360))]
-    assert found["step"] == [(n, i) for n in (200, 400) for i in range(1, n)]
-    assert found["sh_step"] == [(n, i) for n in (200, 400) for i in range(16, n, 16)]
+    assert found["prune"] == [*((100, i) for i in (60, 70, 80, 90)), *((200, i) for i in (120, 140, 160, 180))]
+    assert found["step"] == [(n, i) for n in (100, 200) for i in range(1, n)]
+    assert found["sh_step"] == [(n, i) for n in (100, 200) for i in range(16, n, 16)]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Path, tmp_path: Path) -> None:
     """Coarse levels densify by twice the threshold, as `--coarse-threshold` says; the script's own options stay."""
     seen: dict[int, dict[str, Any]] = {}
-    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *SHORT) as adapter:
         model = adapter.train.GaussianModel
         setup, update = model.training_setup, model.update_learning_rate
 
@@ -271,12 +272,12 @@ def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Pa
 
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         drive(adapter, **THIRDS)
-        thresholds = adapter.densify_thresholds(Namespace(**seen[30]))
-    given = {name: value for name, value in seen[31].items() if name not in thresholds}
-    assert {name: value for name, value in seen[30].items() if name not in thresholds} == given
-    assert given["iterations"] == 90
+        thresholds = adapter.densify_thresholds(Namespace(**seen[10]))
+    given = {name: value for name, value in seen[11].items() if name not in thresholds}
+    assert {name: value for name, value in seen[10].items() if name not in thresholds} == given
+    assert given["iterations"] == 30
     for threshold in thresholds:
-        assert seen[30][threshold] == 2 * seen[31][threshold]
+        assert seen[10][threshold] == 2 * seen[11][threshold]
 
 
 def test_a_nested_level_ends_before_the_reset_that_comes_at_its_end(scene: Path, tmp_path: Path) -> None:
@@ -287,8 +288,7 @@ def test_a_nested_level_ends_before_the_reset_that_comes_at_its_end(scene: Path,
     assert float(opacities.max()) > 0.05, "a reset leaves 0.01"
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "hierarchy"), STUBS_AND_KINDS)
 def test_residuals_reset_no_opacities(name: str, hierarchy: str, scene: Path, tmp_path: Path) -> None:
     """Resets are skipped at the interval and, over white, where densification begins. Nested levels are reset when the
     checkout does it: every 8 iterations until 60, and at iteration 5."""

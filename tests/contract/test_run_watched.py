@@ -14,7 +14,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.watcher import Watcher
-from tests.contract.stub_runs import KINDS, NAMES, STUBS, run_hierarchy
+from tests.contract.stub_runs import STUBS, STUBS_AND_KINDS, run_hierarchy
 
 EVERY = 4
 SHORT = ("--iterations", 45, "--densify_until_iter", 40)
@@ -60,8 +60,7 @@ class Diary(Watcher):
         self.last = dict(fields())
 
 
-@pytest.mark.parametrize("hierarchy", KINDS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "hierarchy"), STUBS_AND_KINDS)
 def test_a_watcher_sees_every_stage_and_changes_nothing(
     name: str, hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import shutil
@@ -148,25 +147,25 @@ def all_finished(large: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunA
 def test_a_run_killed_while_it_archives_jointly_trained_fields_ends_as_others(
     large: Scene, tmp_path: Path, two_finished: Path, all_finished: RunArchive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Kill it at any write after the last stage, and resume it."""
+    """It is killed before a PLY, between two, before the manifest that counts and after it; `test_archive` kills runs
+    at every write."""
     base = [(two_finished / f"level_{level}" / "point_cloud.ply").read_bytes() for level in (2, 1)]
     assert plys(all_finished)[0] != base[0], "the coarser fields were trained along"
     assert plys(all_finished)[1] != base[1]
     writes = FailingWrites(monkeypatch, Killed)
-    left, done = 0, False
-    while not done:
+    complete = []
+    for left in (0, 5, 10, 11):
         folder = shutil.copytree(two_finished, tmp_path / str(left))
-        with contextlib.suppress(Killed):
+        with pytest.raises(Killed):
             resume(folder, large, SHORT, user_hooks=[FailAfterStage(writes, 0, left)])
-            done = True
         writes.left = sys.maxsize
         killed = RunArchive.open(folder)
-        assert plys(killed) == (plys(all_finished) if killed.manifest.complete else base)
+        complete.append(killed.manifest.complete)
+        assert plys(killed) == (plys(all_finished) if complete[-1] else base)
         again = resume(folder, large, SHORT)
         assert plys(again) == plys(all_finished)
         assert files_in(folder) == files_in(all_finished.path())
-        left += 1
-    assert left == 15, "three PLYs and the manifest in three steps each, two renamings, and a run that went well"
+    assert set(complete) == {False, True}
 
 
 def test_a_disk_that_is_full_when_a_stage_ends_keeps_the_fields_before_it(
@@ -181,21 +180,12 @@ def test_a_disk_that_is_full_when_a_stage_ends_keeps_the_fields_before_it(
     assert plys(resume(folder, large, SHORT)) == plys(all_finished)
 
 
-@pytest.mark.parametrize("levels", [2, 3])
-def test_jointly_trained_fields_match_the_photos_better(levels: int, tmp_path: Path) -> None:
+def test_jointly_trained_fields_match_the_photos_better(scene: Scene, tmp_path: Path) -> None:
     """And the run's last PSNR of held-out views is that of the archived fields."""
-    scene = ring_scene(size=(96, 64))
     calm = Densification(start=20, until=100, every=20, reset_every=10_000)
     fits, fields = {}, {}
     for share in (0.0, 0.5):
-        settings = replace(
-            SETTINGS,
-            levels=levels,
-            split="1/2,1/2" if levels == 2 else None,
-            iterations=240,
-            densification=calm,
-            joint=share,
-        )
+        settings = replace(SETTINGS, iterations=240, densification=calm, joint=share)
         archive = train(tmp_path / str(share), scene, settings)
         renderer = HierarchyRenderer.from_archive(archive, CpuRasterizer())
         fits[share], held_out = (
@@ -203,8 +193,8 @@ def test_jointly_trained_fields_match_the_photos_better(levels: int, tmp_path: P
             for views in (scene.train, scene.test)
         )
         assert archive.history()[-1]["psnr"] == pytest.approx(held_out, abs=1e-5)  # 2e-8 seen
-        fields[share] = archive.field(levels - 1)
-    assert fits[0.5] > fits[0.0] + 0.1  # 0.30 and 0.23 dB
+        fields[share] = archive.field(1)
+    assert fits[0.5] > fits[0.0] + 0.1  # 0.30 dB
     assert len(fields[0.5]) == len(fields[0.0])
     assert not torch.equal(fields[0.5].means, fields[0.0].means)
 
@@ -347,9 +337,7 @@ def test_a_hook_that_does_nothing_changes_nothing(scene: Scene, tmp_path: Path) 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"supervision": "online_residual"},
         {"supervision": "gt_laplacian"},
-        {"levels": 1, "split": None},
         {"inherit": "xyz:0.5"},
         {"grid": "even"},
         {"images_on": "disk", "prediction_precision": "float16"},
@@ -357,7 +345,7 @@ def test_a_hook_that_does_nothing_changes_nothing(scene: Scene, tmp_path: Path) 
     ],
 )
 def test_every_option_trains(scene: Scene, tmp_path: Path, changes: dict[str, object]) -> None:
-    settings = replace(SETTINGS, **changes)
+    settings = replace(SETTINGS, iterations=24, **changes)
     archive = train(tmp_path / "run", scene, settings)
     losses = {entry["level"]: entry["loss"] for entry in archive.history()}
     assert all(math.isfinite(loss) for loss in losses.values())

@@ -23,9 +23,9 @@ OF_OTHERS = {
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--depth_loss", "--disable_viewer",
     "--grad_abs_thresh",
     "--highfeature_lr", "--ho_iteration", "--kernel_size", "--loss_thresh", "--max_n_gaussian", "--mult",
-    "--opacity_reset_interval", "--optimizer_type",
-    "--position_lr_final", "--position_lr_max_steps", "--random_background", "--save_iterations", "--sh_lower",
-    "--start_checkpoint", "--target_primitives", "--test_iterations",
+    "--opacity_reset_interval", "--optimizer_type", "--position_lr_final", "--position_lr_max_steps",
+    "--prune_iterations", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
+    "--target_primitives", "--test_iterations",
     # of the authors' release
     "--iter_plan",
     # of the extension in docs/extending.md

@@ -148,8 +148,8 @@ def test_the_backbone_is_recognised_by_its_files(installed: Path, tmp_path: Path
     script: Any = SimpleNamespace(module=SimpleNamespace(SPARSE_ADAM_AVAILABLE=False))
     adapter(script).level_view(view, original, (40, 30), signed=False)
     assert (view.blur, original.blur) == (2.0, 4.0)
-    options = {"dataset": SimpleNamespace(), "opt": SimpleNamespace(densify_grad_threshold=1.0)}
-    call: Any = SimpleNamespace(values=options, roles={name: name for name in options})
+    opt = SimpleNamespace(densify_grad_threshold=1.0)
+    call: Any = SimpleNamespace(dataset=SimpleNamespace(), opt=opt, pipe=None, copied=lambda parsed: call)
     window: Any = SimpleNamespace(stage=Stage(1, (40, 30), 10, signed=False), threshold_factor=2.0)
     with pytest.raises(UserInputError, match="--backbone my_fork: the script has no option my_threshold"):
         adapter(script).stage_call(call, window, "folder")

@@ -17,7 +17,9 @@ from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments import commands
 from lapgs_plugin.experiments.commands import Locations, run_steps
+from lapgs_plugin.experiments.execution import prepare
 from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
+from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.schema import Experiment
 from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.standard import PRESETS
@@ -93,6 +95,20 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
         found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
         assert found == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
         assert specs["residuals"].run_id == specs["default"].run_id != specs["nested"].run_id
+
+
+def test_another_sample_scene_is_trained_anew_in_a_folder_of_its_own(tmp_path: Path) -> None:
+    ids, folders = set(), set()
+    for views in (8, 9):
+        changed = experiment(scenes=[{"name": "a", "sample": {"size": "64x48", "views": views}}])
+        planned = plan_runs(changed, Selection(seeds="0", backbones=["cpu"], variants=["bare"]))
+        mistakes, places = Mistakes(tmp_path / "x.toml", changed, Selection()), Locations({}, tmp_path)
+        jobs, found = prepare(planned, scenes_of(changed, Selection()), places, tmp_path, None, mistakes)
+        mistakes.refuse()
+        ids.add(jobs[0].run_id)
+        folders.add(found["a"][1])
+        assert str(found["a"][1]) in jobs[0].steps[0].command
+    assert len(ids) == len(folders) == 2
 
 
 def test_a_variant_may_have_a_preset_of_its_own() -> None:

@@ -24,17 +24,19 @@ from random import Random
 from types import TracebackType
 from typing import Any
 
+from tests.fuzz.worker import STOPPED
+
 MOST_BYTES = 1_500_000_000
 """Of the whole process, torch and all."""
 MOST_SECONDS = 60.0
+"""Of a processor, which a busy machine gives no case more of."""
+MOST_WAITING = 900.0
+"""Seconds by the clock, for a case that does nothing."""
 MOST_MORE = 4_000_000_000
 """What a case may ask of the system before that refuses: so much is a failure however it is reported."""
 START_SECONDS = 300.0
 LONGEST_LINE = 1_500
 """Characters of a message: one that quotes a whole file is no line."""
-STOPPED = 130
-"""Exit code of a training that `worker` ended: everything that was read was good."""
-
 ROOT = Path(__file__).parents[2]
 Damage = Callable[[bytes, Random], bytes]
 
@@ -111,13 +113,14 @@ class Reader:
         scratch: folder for the cases' files.
 
     Attributes:
-        patience: seconds for a case.
+        patience: seconds of a processor for a case.
+        waits: seconds by the clock for a case.
         highest: most memory that the process ever had, in bytes.
         longest: seconds that a case took.
     """
 
     def __init__(self, scratch: Path) -> None:
-        self.patience = MOST_SECONDS
+        self.patience, self.waits = MOST_SECONDS, MOST_WAITING
         self._scratch = scratch
         self._process: subprocess.Popen[bytes] | None = None
         self._replies = -1
@@ -146,11 +149,13 @@ class Reader:
         started = time.monotonic()
         process.stdin.write(json.dumps({"folder": str(folder), "command": list(command)}).encode() + b"\n")
         process.stdin.flush()
-        answer = self._read(self.patience)
+        used, answer = self._used(), None
+        while answer is None and self._used() - used < self.patience and time.monotonic() - started < self.waits:
+            answer = self._read(min(1.0, self.waits))
         self.longest = max(self.longest, time.monotonic() - started)
         if answer is None:
             self._replace_child()
-            return Problem(f"took more than {self.patience:g} s", " ".join(command))
+            return Problem(f"took more than {min(self.patience, self.waits):g} s", " ".join(command))
         if "ended" in answer:
             self._meet_child()
             return Problem(f"ended the process ({answer['ended']})", self._log.read_text(errors="replace")[-2000:])
@@ -158,6 +163,14 @@ class Reader:
         if answer["highest"] > MOST_BYTES or answer["starved"]:
             self._replace_child()  # what it once had cannot be told from what the next case takes
         return answer
+
+    def _used(self) -> float:
+        """Seconds of a processor that the child has used; 0 where that is unknown, or the child is gone."""
+        try:
+            words = Path(f"/proc/{self._child}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
     @property
     def _log(self) -> Path:
@@ -283,7 +296,7 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
     Args:
         folder: nothing outside of it changes.
         steps: an action, the path it is about, and for "move" another name, for "copy" another path. Those whose
-            paths a former step removed are left out.
+            paths a former step removed or whose other name a folder has are left out.
     """
     for action, name, *other in steps:
         path = folder / name
@@ -296,7 +309,8 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
             target.write_bytes(path.read_bytes())
             continue
         if action == "move":
-            path.rename(path.with_name(target.name))
+            if not path.with_name(target.name).is_dir():
+                path.rename(path.with_name(target.name))
             continue
         if path.is_dir():
             shutil.rmtree(path)

@@ -50,6 +50,8 @@ def misbehave(how: str) -> None:
         raise SystemExit(1)
     if how == "sleep":
         time.sleep(100)
+    while how == "compute":
+        pass
     if how == "grow":
         np.ones(1_500_000_000, np.uint8)
     if how == "ask":

@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from tests.fuzz.harness import MOST_SECONDS, Case, Fuzzer, Kind, judged
+from tests.fuzz.harness import MOST_SECONDS, MOST_WAITING, Case, Fuzzer, Kind, judged
 from tests.fuzz.kinds import BY_NAME, KINDS
 from tests.fuzz.mutations import as_json, as_namespace, as_toml, damaged_tree
 
@@ -16,6 +16,7 @@ HOW = {
     "exit": "exit code 1",
     "abort": "ended the process",
     "sleep": "took more than 1 s",
+    "compute": "took more than 1 s",
     "grow": "more than 1.5 GB",
     "ask": "more than 1.5 GB",
     "nameless": "names no file",
@@ -53,8 +54,9 @@ def test_every_broken_rule_is_told(fuzzer: Fuzzer, how: str) -> None:
 def test_a_process_that_ends_hangs_or_grows_is_told_and_started_again(
     fuzzer: Fuzzer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for how in ("sleep", "abort", "grow", "ask"):
-        monkeypatch.setattr(fuzzer.reader, "patience", 1.0 if how == "sleep" else MOST_SECONDS)
+    for how in ("sleep", "compute", "abort", "grow", "ask"):
+        monkeypatch.setattr(fuzzer.reader, "waits", 1.0 if how == "sleep" else MOST_WAITING)
+        monkeypatch.setattr(fuzzer.reader, "patience", 1.0 if how == "compute" else MOST_SECONDS)
         problem = fuzzer.problem(misbehaving(how))
         assert problem is not None
         assert problem.what.startswith(HOW[how])

@@ -15,8 +15,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.campaign import campaign
-from tests.fuzz.harness import STOPPED, Case, Fuzzer, Kind
+from tests.fuzz.harness import Case, Fuzzer, Kind
 from tests.fuzz.kinds import KINDS
+from tests.fuzz.worker import STOPPED
 
 CASES = 12
 """Of each kind in `make test`."""

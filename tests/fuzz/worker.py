@@ -19,6 +19,10 @@ from typing import Any
 
 STAGE_ITERATIONS = 2
 """Of the finest level, then training is stopped: long enough to use everything that was read."""
+STOPPED = 130
+"""Exit code of a training that this module ended, or that diverged."""
+COARSE_ITERATIONS = 20
+"""Of a coarser level, which whole files do not reach: a damaged manifest may ask for a thousand million."""
 
 
 def serve(replies: int, more: int) -> None:
@@ -79,7 +83,7 @@ def limit_memory(more: int) -> None:
 
 def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -> dict[str, Any]:
     """How a command ended: its exit code, its message or the traceback that escaped, its seconds and bytes."""
-    from lapgs_plugin.errors import LapgsError
+    from lapgs_plugin.errors import LapgsError, TrainingDivergedError
 
     out, errors = io.StringIO(), io.StringIO()
     code, message, trace, starved = 0, "", "", False
@@ -87,6 +91,8 @@ def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
         try:
             commands(command)
+        except TrainingDivergedError:
+            code = STOPPED  # everything was read, and a damaged rate is a large one
         except LapgsError as error:
             code, message, starved = error.exit_code, str(error), _starved(error)
         except SystemExit as error:
@@ -160,7 +166,7 @@ def _stop_training_early() -> None:
             nonlocal done
             after_iteration(each)
             done += 1
-            if each.stage.level == 0 and done == STAGE_ITERATIONS:
+            if done == (STAGE_ITERATIONS if each.stage.level == 0 else COARSE_ITERATIONS):
                 raise TrainingStoppedError("as far as this test goes")
 
         whole(stage_run, after)

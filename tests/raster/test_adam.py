@@ -112,7 +112,7 @@ def test_column_scale_multiplies_the_learning_rate_of_each_column() -> None:
     for columns, lr in ((slice(0, 1), 1e-2), (slice(1, None), 1e-2 / 20)):
         part = torch.nn.Parameter(parameter(SH_SHAPE, torch.float64).detach()[:, columns].clone())
         theirs = descend(torch.optim.Adam([part], lr=lr, eps=1e-15), [value[:, columns] for value in values])
-        torch.testing.assert_close(ours[:, columns], theirs, rtol=0, atol=1e-12 * lr)
+        torch.testing.assert_close(ours[:, columns], theirs, rtol=0, atol=1e-12 * lr)  # 4.4e-16 seen
 
 
 def test_columns_that_become_active_later_train_as_if_they_always_had_been() -> None:
@@ -176,7 +176,7 @@ def test_state_is_that_of_torch_adam(order: tuple[type[Any], type[Any]]) -> None
     param = torch.nn.Parameter(descend(first, values[:10]).clone())
     second = order[1]([param], **options)
     second.state[param] = copy.deepcopy(first.state_dict()["state"][0])
-    torch.testing.assert_close(descend(second, values[10:]), expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(descend(second, values[10:]), expected, rtol=0, atol=1e-14)  # 1.1e-16 seen
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

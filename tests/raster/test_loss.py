@@ -145,7 +145,7 @@ def test_measuring_ssim_compiles_nothing_that_training_has_not_compiled() -> Non
     p, t = (image.detach().float() for image in images((3, 40, 60)))
     photometric_loss_cpu(p.clone().requires_grad_(), t).backward()
     compiled = set(_photometric_kernel.signatures)
-    assert ssim(p, t) == pytest.approx(float(conv_ssim_map(p.double(), t.double()).mean()), abs=1e-6)
+    assert ssim(p, t) == pytest.approx(float(conv_ssim_map(p.double(), t.double()).mean()), abs=1e-6)  # 6.2e-9 seen
     assert set(_photometric_kernel.signatures) == compiled
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import threading
+from contextlib import nullcontext
 from dataclasses import replace
+from multiprocessing.pool import ThreadPool
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -12,7 +15,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lapgs_plugin.checkouts.level_views import SceneImages, make_level_view, view_key, without_depth
+from lapgs_plugin.checkouts.level_views import SceneImages, make_level_view, view_key, view_name, without_depth
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
@@ -46,6 +49,22 @@ def made(name: str = "photo", **options: Any) -> tuple[Camera, SceneImages]:
         return Camera(name, **options), images
     finally:
         Camera.__init__ = original  # type: ignore[method-assign]
+
+
+def test_cameras_may_be_made_in_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in forks that load photos in a pool: two cameras are being made at the same time here."""
+    images, together, original = SceneImages(), threading.Barrier(2, timeout=20), Camera.__init__
+
+    def make(camera: Camera, name: str, data_device: str = "cuda") -> None:
+        together.wait()
+        original(camera, name, data_device)
+        together.wait()
+
+    monkeypatch.setattr(Camera, "__init__", images.adopting(make))
+    with ThreadPool(2) as pool:
+        cameras = pool.map(Camera, ["a", "b"], chunksize=1)
+    assert [view_name(images.key(camera)) for camera in cameras] == ["a", "b"]
+    assert [images[images.key(camera)].size for camera in cameras] == [(WIDTH, HEIGHT)] * 2
 
 
 def test_attributes_follow_the_size_of_the_level() -> None:
@@ -133,7 +152,8 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
         assert image.unique().tolist() == [0.5], "neither composed nor given to hooks"
         if signed:
             with pytest.raises(
-                UserInputError, match=r"other colours than the model's, .* --hierarchy nested"
+                UserInputError,
+                match=r"test_checkout_views.py:\d+: the loop trains on .* other colours than the model's, .* nested",
             ) as caught:
                 image.sum().backward()
             assert "\n" not in str(caught.value)
@@ -141,6 +161,37 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
             image.sum().backward()
     assert render(view).unique().tolist() == [1.375], "the model's own colours are composed"
     assert wrapper.running.given == ()
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_maps_beside_a_residuals_image_are_not_trained_on(signed: bool) -> None:
+    """As gaussian-grouping's features, RaDe-GS's normals: outputs of the call that renders the image."""
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    assert wrapper.rendering is not None
+    wrapper.rendering.signed = signed
+    means = torch.zeros(2, 3, requires_grad=True)
+
+    def forward(means: Tensor, shs: Tensor, rasterizer_settings: Settings) -> dict[str, Tensor]:
+        size = rasterizer_settings.image_height, rasterizer_settings.image_width
+        found = {"radii": (3,), "image": (3, *size), "depth": size, "normals": (*size, 3), "features": (16, *size)}
+        return {name: means.mean().expand(shape) * 1 for name, shape in found.items()}
+
+    function = wrapper._function(forward)
+
+    @wrapper.renderer
+    def render(viewpoint: Any) -> dict[str, Tensor]:
+        found: dict[str, Tensor] = function(means, torch.ones(2, 1, 3), settings(3, 4, torch.zeros(3), torch.eye(4)))
+        return found
+
+    found = render(make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4)))
+    (found["image"].sum() + found["radii"].sum() + 0 * found["depth"].sum()).backward(retain_graph=True)
+    for name in ("depth", "normals", "features"):
+        refused = pytest.raises(
+            UserInputError, match=r"test_checkout_views.py:\d+: the loop trains on an image of other"
+        )
+        with refused if signed else nullcontext():
+            found[name].sum().backward(retain_graph=True)
 
 
 @pytest.mark.parametrize(("model", "first"), [("sh", "image"), ("sh", "depths"), ("colors", "image")])

@@ -100,7 +100,7 @@ def test_gradients_reach_every_composed_level() -> None:
     for level, render in renders.items():
         assert render.grad is not None
         expected = float((parts[level] * weights).sum().detach())
-        assert float((render.grad * render.detach()).sum()) == pytest.approx(expected, rel=1e-9)
+        assert float((render.grad * render.detach()).sum()) == pytest.approx(expected, rel=1e-9)  # 6.4e-16 seen
 
 
 def test_one_level_is_the_plain_render() -> None:
@@ -134,7 +134,7 @@ def test_frames_are_clamped_images(signed: bool) -> None:
     for level in range(3):
         images = renderer.images([CAMERA], level)
         assert float(images.abs().max()) > 1 or level == 1
-        torch.testing.assert_close(renderer.frames([CAMERA], level), images.clamp(0, 1), rtol=0, atol=1e-6)
+        torch.testing.assert_close(renderer.frames([CAMERA], level), images.clamp(0, 1), rtol=0, atol=1e-6)  # 0 seen
 
 
 def test_a_coarser_level_stops_early() -> None:

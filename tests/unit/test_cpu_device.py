@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from importlib import import_module
 from importlib.util import find_spec
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,6 +35,14 @@ def missing(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     for name in [key for key in sys.modules if key.partition(".")[0] in names]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(absent, "find_spec", lambda name: None if name in names else find_spec(name))
+
+
+def test_threads_that_are_started_inside_name_devices_too() -> None:
+    """As checkouts that load photos in a pool of threads."""
+    run = threading.Thread.run
+    with cuda_on_cpu("fastgs"), ThreadPool(2) as pool:
+        assert all(on_cpu(made) for made in pool.map(lambda _: torch.ones(2, device="cuda").cuda(), range(4)))
+    assert threading.Thread.run is run
 
 
 @pytest.mark.parametrize("device", CUDA, ids=repr)
@@ -185,7 +195,7 @@ def state() -> dict[str, Any]:
 
 
 def test_everything_is_restored_by_identity(monkeypatch: pytest.MonkeyPatch) -> None:
-    missing(monkeypatch, "torchvision", "cv2", "websockets", "tqdm")
+    missing(monkeypatch, "torchvision", "cv2", "websockets")
     with cuda_on_cpu("taming"):
         assert on_cpu(torch.ones(1, device="cuda"))  # torch imports some modules at first use
     before = state()
@@ -197,7 +207,7 @@ def test_everything_is_restored_by_identity(monkeypatch: pytest.MonkeyPatch) -> 
     assert {name for name in inside if inside[name] is not before.get(name)} >= {
         "torch.load", "torch.autograd._engine_run_backward", "modes", "torch.cuda.Event", "torch.cuda.synchronize",
         "sys.modules diff_gaussian_rasterization",
-        "sys.modules torchvision.transforms", "sys.modules cv2", "sys.modules tqdm",
+        "sys.modules torchvision.transforms", "sys.modules cv2",
     }  # fmt: skip
     assert before.keys() == after.keys()
     assert [name for name in before if before[name] is not after[name]] == []
@@ -264,20 +274,6 @@ def test_edges_are_those_of_eight_bit_pictures(monkeypatch: pytest.MonkeyPatch) 
             transforms.ToPILImage()(between[:2])
         with pytest.raises(MissingExtraError, match="ndarray"):
             transforms.ToPILImage()(between.numpy())
-
-
-def test_a_progress_bar_without_tqdm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    missing(monkeypatch, "tqdm")
-    with cuda_on_cpu("fastgs"):
-        bar = import_module("tqdm").tqdm(range(30), desc="Training progress")
-        bar.set_postfix({"Loss": "0.5"})
-        bar.update(10)
-        bar.close()
-        bar.close()
-        assert list(import_module("tqdm").tqdm(letter for letter in "ab")) == ["a", "b"]
-    lines = capsys.readouterr().err.splitlines()
-    assert "Training progress: 10/30 Loss=0.5" in lines
-    assert "Progress: 2 " in lines
 
 
 SCRIPT = """

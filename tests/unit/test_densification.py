@@ -91,11 +91,12 @@ def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, o
         return
     assert term is not None
     opacities, sizes = 1 / (1 + np.exp(-field.opacity_logits.detach().numpy())), np.exp(field.log_scales.numpy())
+    # 2.0e-7 seen.
     assert float(term.detach()) == pytest.approx(opacity * opacities.mean() + scale * sizes.mean(), rel=1e-6)
     if opacity:
         (gradient,) = torch.autograd.grad(term, field.opacity_logits)
         expected = opacity * opacities * (1 - opacities) / len(field)
-        np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-5)
+        np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-5)  # 1.2e-6 seen
 
 
 def test_statistics_of_no_gaussians_are_empty() -> None:

@@ -41,14 +41,14 @@ def test_transform_and_its_gradients_are_the_closed_form() -> None:
     leaves = image.clone().requires_grad_(), transform.clone().requires_grad_()
     out = transform_colors(*leaves)
     expected = np.einsum("bij,bjhw->bihw", transform[:, :, :3], image) + transform[:, :, 3, None, None].numpy()
-    np.testing.assert_allclose(out.detach(), expected, atol=1e-14)
+    np.testing.assert_allclose(out.detach(), expected, atol=1e-14)  # 0 seen
     by_image, by_transform = torch.autograd.grad(out, leaves, by_out)
-    np.testing.assert_allclose(by_image, np.einsum("bij,bihw->bjhw", transform[:, :, :3], by_out), atol=1e-14)
+    np.testing.assert_allclose(by_image, np.einsum("bij,bihw->bjhw", transform[:, :, :3], by_out), atol=1e-14)  # 0 seen
     ones = torch.cat([image, torch.ones_like(image[:, :1])], dim=1)
-    np.testing.assert_allclose(by_transform, np.einsum("bihw,bjhw->bij", by_out, ones), atol=1e-13)
+    np.testing.assert_allclose(by_transform, np.einsum("bihw,bjhw->bij", by_out, ones), atol=1e-13)  # 3.6e-15 seen
     assert torch.autograd.gradcheck(transform_colors, leaves)
     one = transform_colors(image[0], transform[0])
-    torch.testing.assert_close(one, out[0].detach(), atol=1e-14, rtol=0)
+    torch.testing.assert_close(one, out[0].detach(), atol=1e-14, rtol=0)  # 0 seen
 
 
 def test_measure_finds_the_gains_of_photos() -> None:
@@ -214,8 +214,8 @@ def test_several_views_are_transformed_as_each_is() -> None:
     (by_all,) = torch.autograd.grad(together.square().mean(), exposures.transforms)
     each = [exposures.apply([name], image) for name, image in zip(["c", "a"], images, strict=True)]
     (by_each,) = torch.autograd.grad(torch.stack(each).square().mean(), exposures.transforms)
-    torch.testing.assert_close(together, torch.stack(each), atol=1e-6, rtol=0)
-    torch.testing.assert_close(by_all, by_each, atol=1e-6, rtol=0)
+    torch.testing.assert_close(together, torch.stack(each), atol=1e-6, rtol=0)  # 0 seen
+    torch.testing.assert_close(by_all, by_each, atol=1e-6, rtol=0)  # 0 seen
     assert by_all[1].abs().max() == 0
 
 
@@ -228,7 +228,7 @@ def test_neighbours_predict_exposure_that_changes_slowly() -> None:
     slow = transforms_of(np.sin(np.arange(30) / 5))
     found = predicted_exposures(slow, ["013.jpg", "000.jpg", "999.jpg"])
     expected = (np.array(slow["012.jpg"]) + np.array(slow["014.jpg"])) / 2
-    np.testing.assert_allclose(found["013.jpg"], expected, rtol=1e-6)
+    np.testing.assert_allclose(found["013.jpg"], expected, rtol=1e-6)  # 2.5e-8 seen
     np.testing.assert_allclose(found["000.jpg"], slow["000.jpg"], rtol=1e-6)  # a training photo has its own
     np.testing.assert_allclose(found["999.jpg"], slow["058.jpg"], rtol=1e-6)  # behind the last one
 
@@ -254,4 +254,4 @@ def test_evaluation_measures_renders_with_the_predicted_exposure(tmp_path: Path)
     image = 1.25 * renderer.render(view.camera).composed[0].numpy()
     error = np.square(np.clip(image, 0, 1) - view.image.numpy()).mean()
     (figures,) = (each for each in brighter["views"] if each["name"] == view.name)
-    assert figures["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+    assert figures["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)  # 3.8e-7 seen

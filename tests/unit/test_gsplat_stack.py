@@ -219,7 +219,7 @@ def test_antialiasing_dims_by_the_area_that_was_added() -> None:
     for antialiased, factor in ((False, 1.0), (True, variance / (variance + 0.3))):
         (image,) = GsplatStack([small], CPU, antialiased=antialiased).render([camera], None)
         expected = opacity * factor * float(0.5 / math.sqrt(math.pi))  # of Y_00
-        assert float(image[0, 8, 8]) == pytest.approx(expected, rel=1e-5)
+        assert float(image[0, 8, 8]) == pytest.approx(expected, rel=1e-5)  # 6.4e-8 seen
 
 
 def test_later_changes_of_a_field_are_not_seen() -> None:

@@ -211,7 +211,7 @@ def test_terms_of_the_loss_add_up_with_their_gradients() -> None:
     both = HookDispatcher([SupervisionLoss(SUPERVISIONS["reconstructed"]), Weight()]).loss(here, image)
     torch.testing.assert_close(both, plain + 3.0 * image.sum())
     (gradient,) = torch.autograd.grad(both - plain, image)
-    torch.testing.assert_close(gradient, torch.full_like(image, 3.0), atol=1e-5, rtol=0)
+    torch.testing.assert_close(gradient, torch.full_like(image, 3.0), atol=1e-5, rtol=0)  # 0 seen
 
 
 def test_a_hook_sees_no_more_than_the_context() -> None:

@@ -8,7 +8,6 @@ import random
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -409,11 +408,3 @@ def test_a_refusal_of_the_driver_is_not_reported_by_the_next_launch(monkeypatch:
 def is_page_locked(stored: Tensor) -> bool:
     # `is_pinned` asks about the first byte of a tensor's storage, and ours begins before the pages that are locked.
     return torch.from_numpy(stored.numpy()).is_pinned()
-
-
-def test_images_are_on_a_gpu_while_they_are_a_small_part_of_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    for memory, limit in ((80 << 30, 1 << 30), (6_000_000_000, 600_000_000)):
-        properties = SimpleNamespace(total_memory=memory)
-        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _, properties=properties: properties)
-        assert [place(limit + more, "cuda") for more in (0, 1)] == ["gpu", "memory"]
-        assert place(1, "cpu") == "memory"

@@ -18,14 +18,14 @@ from lapgs_plugin.evaluation.metrics import mean_quality, psnr, ssim
 @settings(max_examples=30, deadline=None)
 def test_psnr_of_a_constant_offset(offset: float, low: float) -> None:
     target = torch.full((3, 7, 5), low, dtype=torch.float64)
-    assert psnr(target + offset, target) == pytest.approx(-20 * math.log10(offset), abs=1e-9)
+    assert psnr(target + offset, target) == pytest.approx(-20 * math.log10(offset), abs=1e-9)  # 7.1e-15 seen
 
 
 def test_psnr_is_over_all_channels_at_once() -> None:
     target = torch.zeros(3, 4, 4)
     image = target.clone()
     image[0] = 0.3  # a mean over channels of each channel's own PSNR would be infinite
-    assert psnr(image, target) == pytest.approx(-10 * math.log10(0.3**2 / 3), abs=1e-5)
+    assert psnr(image, target) == pytest.approx(-10 * math.log10(0.3**2 / 3), abs=1e-5)  # 3.5e-7 seen
 
 
 def test_psnr_looks_at_what_is_shown() -> None:

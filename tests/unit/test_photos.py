@@ -20,7 +20,7 @@ import pycolmap
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
 from lapgs_plugin.scenes import load_scene
@@ -33,9 +33,10 @@ from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
 from lapgs_plugin.scenes.prepare.inputs import one_camera
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
-from lapgs_plugin.scenes.prepare.photos import find_photos
+from lapgs_plugin.scenes.prepare.photos import Photos, find_photos
 from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
+from lapgs_plugin.scenes.prepare.writing import write_scene
 from lapgs_plugin.scenes.sample.raycast import render
 from tests.unit.test_prepare import FOCAL, SIZE, WORLD, _arc, _centre_errors
 
@@ -97,6 +98,36 @@ def test_photos_of_a_phone_become_a_scene(tmp_path: Path, caplog: pytest.LogCapt
     assert by_name["02.jpg"].mask is not None
     assert bool(by_name["02.jpg"].mask[0, :, 5].all())  # stored pixels, as COLMAP and trainers read them
     assert not bool(by_name["00.png"].mask[0, :, 5].any())
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8, 5])
+def test_a_scene_is_turned_as_exif_says_of_most_photos(tmp_path: Path, orientation: int) -> None:
+    """Pillow turns the photos, and pycolmap projects points into the turned images where their features are."""
+    photos, model = tmp_path / "photos", pycolmap.Reconstruction()
+    photos.mkdir()
+    lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=96, height=64, params=[80, 70, 45, 33])
+    model.add_camera_with_trivial_rig(lens)
+    points = RANDOM.uniform(-1, 1, (20, 3))
+    for index in range(3):
+        exif = Image.Exif()
+        exif[ORIENTATION] = orientation if index else 1
+        Image.fromarray(WALL[:64, 9 * index : 9 * index + 96]).save(photos / f"{index}.png", exif=exif)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2 * index, 0.3])), np.array([0.1 * index, 0, 5]))
+        features = [pycolmap.Point2D(lens.img_from_cam(pose * point)) for point in points]
+        image = pycolmap.Image(name=f"{index}.png", points2D=features, camera_id=1, image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pose)
+    files = {f"{index}.png": photos / f"{index}.png" for index in range(3)}
+    job = Job(tmp_path / "work", Photos(photos, files), PrepareSettings(), progress=False)
+    write_scene(job, model)
+    written = pycolmap.Reconstruction(job.scene / "sparse" / "0")
+    for image in written.images.values():
+        with Image.open(photos / image.name) as stored, Image.open(job.scene / "images" / image.name) as whole:
+            upright = ImageOps.exif_transpose(stored) if orientation != 5 else stored  # mirrored: left as it is
+            assert whole.size == (image.camera.width, image.camera.height)
+            if image.name != "0.png":
+                assert np.abs(np.asarray(whole, np.int16) - np.asarray(upright)).max() <= 1
+        for point, feature in zip(points, image.points2D, strict=True):
+            assert np.abs(image.project_point(point) - feature.xy).max() < 1e-9  # seen 6e-14
 
 
 def test_transparent_pixels_are_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

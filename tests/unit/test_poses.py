@@ -191,7 +191,7 @@ def test_held_out_views_move_with_their_neighbours_where_corrections_change_slow
     slow = {f"{2 * index:03d}.png": [0.01 * each for each in row] for index, row in enumerate(waves)}
     found = predicted_poses(slow, ["013.png", "004.png"])
     assert found["013.png"] == pytest.approx(np.mean([slow["012.png"], slow["014.png"]], axis=0), rel=1e-9)
-    assert found["004.png"] == pytest.approx(slow["004.png"], rel=1e-9)
+    assert found["004.png"] == pytest.approx(slow["004.png"], rel=1e-9)  # 0 seen
     jumping = {name: [(-1.0) ** index * each for each in row] for index, (name, row) in enumerate(slow.items())}
     assert predicted_poses(jumping, ["013.png"]) == {}
     assert predicted_poses({}, ["013.png"]) == {}
@@ -200,7 +200,7 @@ def test_held_out_views_move_with_their_neighbours_where_corrections_change_slow
     views = ViewPoses.create(scene.train, poses, scene.extent, torch.device("cpu"), 0, 100)
     camera = scene.test[1].camera
     shift = views.camera(scene.test[1].name, camera).position - camera.position
-    torch.testing.assert_close(shift[:2], torch.tensor([0.3, 0.1]), atol=5e-6, rtol=0)
+    torch.testing.assert_close(shift[:2], torch.tensor([0.3, 0.1]), atol=5e-6, rtol=0)  # 9.7e-8 seen
     assert views.camera(scene.test[1].name, camera) is views.camera(scene.test[1].name, camera)
 
 

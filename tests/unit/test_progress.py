@@ -44,7 +44,7 @@ def test_lines_are_ten_seconds_to_a_minute_apart(
     monkeypatch: pytest.MonkeyPatch, items: int, seconds_each: float, apart: float
 ) -> None:
     lines = lines_of(monkeypatch, items, seconds_each)
-    assert len(lines) == pytest.approx(items * seconds_each / apart, abs=1)
+    assert len(lines) == pytest.approx(items * seconds_each / apart, abs=1)  # 0.67 seen
 
 
 def test_a_terminal_has_a_bar_and_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,17 +82,17 @@ def test_without_cuda_the_fast_one_renders_and_says_what_it_cannot_honour(line: 
     assert chosen(placed) == ("cpu", "cpu")
     assert placed.unsupported == {"mult": 0.5}
     assert line() == (
-        f"rendering with cpu on the CPU: the fastest without a CUDA device; the run was trained with {FASTGS}, images "
-        "may differ slightly; cpu cannot honour mult = 0.5 of the training "
+        f"rendering with the CPU rasterizer: the fastest without a CUDA device; the run was trained with {FASTGS}, "
+        "images may differ slightly; cpu cannot honour mult = 0.5 of the training "
         f"(--rasterizer {FASTGS} can, slowly on a CPU)"
     )
 
 
 @pytest.mark.usefixtures("no_cuda")
-@pytest.mark.parametrize("trained", ["cpu", "oracle"])
-def test_a_run_of_ours_is_rendered_as_it_was_trained(trained: str, line: Any) -> None:
+@pytest.mark.parametrize(("trained", "shown"), [("cpu", "the CPU rasterizer"), ("oracle", "oracle on the CPU")])
+def test_a_run_of_ours_is_rendered_as_it_was_trained(trained: str, shown: str, line: Any) -> None:
     assert chosen(rasterizer_for(manifest(trained))) == (trained, "cpu")
-    assert line() == f"rendering with {trained} on the CPU: the one it was trained with"
+    assert line() == f"rendering with {shown}: as in training"
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -155,7 +155,7 @@ def test_with_cuda_the_rasterizer_of_the_training_renders_with_its_settings(line
         placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == (FASTGS, "cuda")
     assert placed.unsupported == {}
-    assert line() == f"rendering with {FASTGS} on A GPU: the one it was trained with"
+    assert line() == f"rendering with {FASTGS} on A GPU: as in training"
 
 
 @pytest.mark.usefixtures("cuda")

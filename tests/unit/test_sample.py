@@ -106,7 +106,7 @@ def test_points_are_off_the_surface_by_the_noise_that_is_promised(
 ) -> None:
     off = np.array([model.points3D[key].xyz - surface_points[key] for key in model.points3D])
     # 1500 normal numbers: their deviation is known to 1.8 %, their mean to 2.6 % of it; four times that.
-    np.testing.assert_allclose(off.std(), NOISE, rtol=0.075)
+    np.testing.assert_allclose(off.std(), NOISE, rtol=0.075)  # 0.016 seen
     np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.18 * NOISE)
 
 
@@ -161,17 +161,19 @@ def test_the_red_ring_of_the_plinth_is_where_colmap_projects_it(
     assert share_of_red(0.90) < 0.05
 
 
-def test_a_larger_image_shows_the_same_and_more(scene: Path, tmp_path: Path, pictures: dict[str, NDArray]) -> None:
-    make_sample_scene(tmp_path / "large", width=2 * WIDTH, height=2 * HEIGHT, views=2, points=20, progress=False)
-    large = cv2.imread(str(tmp_path / "large" / "images" / "0001.png"))[:, :, ::-1].astype(np.float32) / 255
-    halved = cv2.resize(large, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+def test_a_larger_image_shows_the_same_and_more(tmp_path: Path, pictures: dict[str, NDArray]) -> None:
+    half = (WIDTH // 2, HEIGHT // 2)
+    make_sample_scene(tmp_path / "half", width=half[0], height=half[1], views=2, points=20, progress=False)
+    small = cv2.imread(str(tmp_path / "half" / "images" / "0001.png"))[:, :, ::-1].astype(np.float32) / 255
+    halved = cv2.resize(pictures["0001.png"], half, interpolation=cv2.INTER_AREA)
     shifted = np.roll(halved, 1, axis=1)
-    same, other = (float(np.sqrt(np.mean((pictures["0001.png"] - image) ** 2))) for image in (halved, shifted))
-    # Seen: 0.032 (averages are taken after encoding here, before it in the scene) against 0.16.
-    assert same < 0.04
+    same, other = (float(np.sqrt(np.mean((small - image) ** 2))) for image in (halved, shifted))
+    # Seen: 0.038 (averages are taken after encoding here, before it in the scene) against 0.16.
+    assert same < 0.05
     assert same < other / 3
-    enlarged = cv2.resize(pictures["0001.png"], (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_CUBIC)
-    assert np.sqrt(np.mean((large - enlarged) ** 2)) > 0.05  # seen 0.077: detail that the smaller image cannot hold
+    enlarged = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    error = np.sqrt(np.mean((pictures["0001.png"] - enlarged) ** 2))
+    assert error > 0.05  # seen 0.099: detail that the smaller image cannot hold
 
 
 def test_images_have_energy_at_high_frequencies(pictures: dict[str, NDArray[np.float32]]) -> None:
@@ -316,6 +318,7 @@ def test_blocks_of_an_image_miss_no_solid() -> None:
         ({"views": 1}, "--views 1: expected 2 to 9999"),
         ({"points": 0}, "--points 0: expected at least 1"),
         ({"width": 8}, "--size 8x32: expected at least 16x16"),
+        ({"width": 99_999}, "--size 99999x32: expected at most 8192x8192"),
         ({"seed": -1}, "--seed -1: expected 0 or more"),
     ],
 )

@@ -167,8 +167,8 @@ def test_pre_resized_photos_rescale_the_camera(tmp_path: Path, size: tuple[int, 
     camera = scene.train[0].camera
     sx, sy = size[0] / 96, size[1] / 64
     assert camera.size == size
-    assert (camera.fx, camera.fy) == pytest.approx((80 * sx, 82 * sy), rel=1e-12)
-    assert (camera.cx, camera.cy) == pytest.approx((47.3 * sx, 33.1 * sy), rel=1e-12)
+    assert (camera.fx, camera.fy) == pytest.approx((80 * sx, 82 * sy), rel=1e-12)  # 0 seen
+    assert (camera.cx, camera.cy) == pytest.approx((47.3 * sx, 33.1 * sy), rel=1e-12)  # 0 seen
 
 
 @pytest.mark.parametrize("size", [(96, 60), (64, 96), (64, 64), (90, 64)])
@@ -201,8 +201,8 @@ def test_points_colors_and_extent(tmp_path: Path) -> None:
     scene = load(make_scene(tmp_path), eval=True)
     order = np.lexsort(scene.points.numpy().T)
     expected = np.lexsort(POINTS.T)
-    np.testing.assert_allclose(scene.points.numpy()[order], POINTS[expected], atol=1e-6)
-    np.testing.assert_allclose(scene.colors.numpy()[order], COLORS[expected] / 255, atol=1e-6)
+    np.testing.assert_allclose(scene.points.numpy()[order], POINTS[expected], atol=1e-6)  # 2.8e-8 seen
+    np.testing.assert_allclose(scene.colors.numpy()[order], COLORS[expected] / 255, atol=1e-6)  # 3.0e-8 seen
     assert scene.points.dtype == scene.colors.dtype == torch.float32
     reconstruction = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     names = {view.name for view in scene.train}
@@ -366,6 +366,13 @@ def test_a_folder_around_a_scene_is_told_where_it_is(tmp_path: Path, name: str) 
     (tmp_path / name / "sparse" / "0" / "cameras.bin").write_bytes(b"")
     with pytest.raises(SceneError, match=rf"neither .* in it; give \S+/{name}, which has one"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["images", "sparse", "sparse/0"])
+def test_a_folder_in_a_scene_is_told_which_it_is(tmp_path: Path, name: str) -> None:
+    path = make_scene(tmp_path / "garden")
+    with pytest.raises(SceneError, match=rf"garden/{name}: neither .* in it; give \S+/garden, which has one"):
+        load(path / name)
 
 
 def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:

@@ -39,6 +39,10 @@ def training(opt, args, testing_iterations, seen, unused=None):
             seen.unlock(iteration)
         if iteration == GLOBAL.late:
             seen.once(iteration)
+        if iteration == args["late"] or iteration == MORE["late"]:
+            seen.twice(iteration)
+        if iteration in args["prune_iterations"] or iteration in MORE["reset_iterations"]:
+            seen.pruned(iteration)
         if iteration == opt.iterations:
             seen.close(iteration)
 """
@@ -48,6 +52,10 @@ OPT = {
     "opacity_reset_interval": 3000, "white": False, "prune_from": 6000, "prune_until": 30_000, "prune_interval": 3000,
     "culling": 5000,
 }  # fmt: skip
+
+
+ARGS: dict[str, Any] = {"late": 24_000, "prune_iterations": [500, 16_000, 24_000]}
+MORE: dict[str, Any] = {"late": 22_000, "reset_iterations": [18_000]}
 
 
 class Seen:
@@ -75,11 +83,11 @@ class Window:
 def trained(stage: int | None, **opt: Any) -> tuple[dict[str, list[int]], list[str]]:
     """Run the loop, as it is or for a stage of so many iterations; return calls by name, and what was changed."""
     tree = ast.parse(LOOP)
-    namespace: dict[str, Any] = {"GLOBAL": SimpleNamespace(late=20_000)}
+    namespace: dict[str, Any] = {"GLOBAL": SimpleNamespace(late=20_000), "MORE": MORE}
     exec(compile(tree, "train.py", "exec"), namespace)
     function, seen = namespace["training"], Seen()
     own = SimpleNamespace(**{**OPT, **opt})
-    values = {"opt": own, "args": None, "testing_iterations": [7], "seen": seen, "unused": None}
+    values = {"opt": own, "args": ARGS, "testing_iterations": [7], "seen": seen, "unused": None}
     if stage is None:
         function(**values)
         return seen.at, []
@@ -92,6 +100,7 @@ def trained(stage: int | None, **opt: Any) -> tuple[dict[str, list[int]], list[s
     changed = Schedule(definition).for_stage({**namespace, **values}, {**values, "opt": of_stage}, window)
     changed.function(function)(**changed.arguments({**values, "opt": of_stage}))
     assert (vars(own), namespace["GLOBAL"].late) == ({**OPT, **opt}, 20_000), "the script's own options stay"
+    assert (ARGS["late"], MORE["reset_iterations"]) == (24_000, [18_000]), "these too"
     assert namespace["training"] is function
     return seen.at, changed.notes
 
@@ -99,9 +108,10 @@ def trained(stage: int | None, **opt: Any) -> tuple[dict[str, list[int]], list[s
 def test_late_events_keep_their_share_and_all_else_its_count() -> None:
     whole, _ = trained(None)
     half, notes = trained(15_000)
-    for name in ("prune_late", "prune_hard", "once"):
+    for name in ("prune_late", "prune_hard", "once", "twice"):
         assert half[name] == [i // 2 for i in whole[name]], name
         assert len(half[name]) > 0
+    assert half["pruned"] == [500, 8000, 9000, 12_000], "no report, whose list would count over the whole run"
     assert half["unlock"] == [500, 7750, 9000], "an early iteration is warm-up"
     assert half["oneupSHdegree"] == list(range(1000, 15_001, 1000))
     assert half["densify"] == list(range(600, 7500, 100))

@@ -30,7 +30,7 @@ from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-from lapgs_plugin.training.model import TrainableField, fused_steps, gpu_adam
+from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import check_storage
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
@@ -251,29 +251,6 @@ def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -
     assert all(bool((archive.field(level).sh[:, 1:] != 0).any()) for level in (1, 0))
     assert archive.history()[-1]["psnr"] > archive.history()[0].get("psnr", 0)
     assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
-
-
-def test_fused_steps_have_the_bits_of_the_optimizers_own() -> None:
-    generator = torch.Generator().manual_seed(3)
-    start = [torch.randn(20, width, generator=generator) for width in (3, 4, 1)]
-    rates = (1e-3, 5e-2, 2.5e-3)
-    ours, theirs = (
-        [gpu_adam(torch.nn.Parameter(value.clone()), rate, False) for value, rate in zip(start, rates, strict=True)]
-        for _ in range(2)
-    )
-    for step in range(4):
-        for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-            gradient = None if (step, index) == (2, 1) else torch.randn(start[index].shape, generator=generator)
-            for optimizer in (one, other):
-                optimizer.param_groups[0]["lr"] = rates[index] / (step + 1)
-                optimizer.param_groups[0]["params"][0].grad = gradient
-        fused_steps(ours)  # type: ignore[arg-type]  # Adam, where steps are not sparse
-        for optimizer in theirs:
-            optimizer.step()
-    for one, other in zip(ours, theirs, strict=True):
-        (param,), (expected,) = (optimizer.param_groups[0]["params"] for optimizer in (one, other))
-        assert torch.equal(param, expected)
-        assert all(torch.equal(one.state[param][name], other.state[expected][name]) for name in other.state[expected])
 
 
 def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:

@@ -56,7 +56,7 @@ def test_an_orbit_before_one_sided_cameras_stays_among_them() -> None:
 def test_a_spline_passes_its_cameras_at_an_even_speed() -> None:
     cameras = ring(13, angle=2.0)
     path = spline(cameras, 12 * 10 + 1)
-    np.testing.assert_allclose(camera_positions(path)[::10], camera_positions(cameras), atol=1e-5)
+    np.testing.assert_allclose(camera_positions(path)[::10], camera_positions(cameras), atol=1e-5)  # 2.4e-7 seen
     for passed, camera in zip(path[::10], cameras, strict=True):
         torch.testing.assert_close(passed.world_to_camera, camera.world_to_camera, atol=1e-5, rtol=0)
     angle = 2.0 * 12 / 13 / 120
@@ -67,8 +67,8 @@ def test_a_spline_through_many_cameras_begins_and_ends_with_them() -> None:
     cameras = ring(90, angle=3.0)
     path = spline(cameras, 200)
     places, known = camera_positions(path), camera_positions(cameras)
-    np.testing.assert_allclose(places[[0, -1]], known[[0, -1]], atol=1e-5)
-    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 2]), 4.0, atol=1e-2)
+    np.testing.assert_allclose(places[[0, -1]], known[[0, -1]], atol=1e-5)  # 6.0e-8 seen
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 2]), 4.0, atol=1e-2)  # 3.3e-5 seen
 
 
 def test_a_spline_through_cameras_at_one_place_stands_or_turns() -> None:
@@ -78,7 +78,7 @@ def test_a_spline_through_cameras_at_one_place_stands_or_turns() -> None:
     other = torch.eye(4)
     other[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 60, degrees=True).as_matrix()).float()
     path = spline([turned, Camera(56, 40, 50.0, 50.0, 28.0, 20.0, other)], 7)
-    np.testing.assert_allclose(turns(path), math.radians(10), atol=1e-4)
+    np.testing.assert_allclose(turns(path), math.radians(10), atol=1e-4)  # 3.6e-8 seen
 
 
 @settings(deadline=None, max_examples=25)
@@ -94,7 +94,7 @@ def test_every_camera_of_a_spline_is_rigid(keys: int, frames: int, seed: int) ->
     assert len(path) == frames
     for camera in path:
         rotation = camera.world_to_camera[:3, :3]
-        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)  # 1.2e-7 seen
 
 
 def test_cameras_out_of_order_are_walked_past_in_turn() -> None:
@@ -123,7 +123,7 @@ def test_files_come_back_as_written(tmp_path: Path) -> None:
     path = tmp_path / "path.json"
     path.write_text(json.dumps(trajectory_json(cameras)))
     for read, camera in zip(read_trajectory(path), cameras, strict=True):
-        torch.testing.assert_close(read.world_to_camera, camera.world_to_camera, atol=1e-5, rtol=0)
+        torch.testing.assert_close(read.world_to_camera, camera.world_to_camera, atol=1e-5, rtol=0)  # 4.8e-7 seen
         assert (read.width, read.height, read.fx, read.cy) == (camera.width, camera.height, camera.fx, camera.cy)
 
 

@@ -80,7 +80,8 @@ def test_on_a_cpu_it_is_up_and_the_sum(grid: str, shape: tuple[int, int, int], d
 def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     coarse, fine, expected = images("camera", (2, 3, 33, 50), torch.float32)
     turned = [image.movedim(1, -1).contiguous().movedim(-1, 1) for image in (coarse, fine)]
-    torch.testing.assert_close(upsample_add(Pyramid(), *turned), expected, rtol=0, atol=5e-6)
+    torch.testing.assert_close(upsample_add(Pyramid(), *turned), expected, rtol=0, atol=5e-6)  # 4.8e-7 seen
+    # 3.6e-7 seen.
     torch.testing.assert_close(upsample(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
 
 
@@ -101,7 +102,7 @@ def test_gradients_go_through() -> None:
     upsample_add(Pyramid(), coarse, fine).sum().backward()
     assert coarse.grad is not None
     # Every fine pixel is an average of coarse ones: their gradients add up to the number of fine pixels.
-    assert coarse.grad.sum().item() == pytest.approx(3 * 8 * 9, rel=1e-5)
+    assert coarse.grad.sum().item() == pytest.approx(3 * 8 * 9, rel=1e-5)  # 7.1e-8 seen
 
 
 @settings(deadline=None, max_examples=60)
@@ -123,7 +124,7 @@ def test_transposed_taps_are_the_gradient(grid: str, size: int) -> None:
     leaf, fine = torch.randn((size + 1) // 2, 1, dtype=torch.float64, requires_grad=True), torch.randn(size).double()
     (Pyramid(grid).up(leaf, (size, 1))[:, 0] * fine).sum().backward()
     taken = (weights * fine[first[:, None] + torch.arange(weights.shape[1])]).sum(1)
-    torch.testing.assert_close(taken, leaf.grad[:, 0], rtol=0, atol=1e-14)
+    torch.testing.assert_close(taken, leaf.grad[:, 0], rtol=0, atol=1e-14)  # 8.9e-16 seen
 
 
 def put_in_place(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:

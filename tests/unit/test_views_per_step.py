@@ -270,7 +270,7 @@ def test_steps_for_several_views_are_adams_with_scaled_rates(in_two: bool) -> No
             step = (unbiased[0] / root) / ((unbiased[1] / views).sqrt() + ADAM_EPS / root)
             expected[name] = value - rates[name] * root * scale * step
         for name, value in expected.items():
-            torch.testing.assert_close(model.params[name].detach().double(), value, rtol=1e-5, atol=2e-6)
+            torch.testing.assert_close(model.params[name].detach().double(), value, rtol=1e-5, atol=2e-6)  # 4.2e-7 seen
     assert all(model.optimizers[name].param_groups[0]["lr"] == rate for name, rate in rates.items() if name != "means")
     assert model.optimizers["means"].param_groups[0]["lr"] == pytest.approx(1e-3 * math.sqrt(8))
 
@@ -292,7 +292,7 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_pat
         assert one[:2] == other[:2]
         if one[0] == 1 and one[1] < 40:  # sums in another order, until one makes a refinement differ
             assert one[2] == other[2]
-            assert one[3] == pytest.approx(other[3], abs=1e-3)
+            assert one[3] == pytest.approx(other[3], abs=1e-3)  # 1.2e-5 seen
     assert {count for count, _, _ in batching.asked} == {2, 3, 4}
     assert runs[0].manifest.complete
     assert runs[1].manifest.complete
@@ -378,7 +378,7 @@ def test_hooks_are_called_for_every_view_and_once_a_step(scene: Scene, tmp_path:
         assert torch.equal(counter.cameras[view.name].world_to_camera, view.camera.world_to_camera)
     without = train(tmp_path / "without", scene, settings, rasterizer)
     for name, value in without.field(0).parameters.items():
-        torch.testing.assert_close(with_hook.field(0).parameters[name], value, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(with_hook.field(0).parameters[name], value, rtol=1e-3, atol=1e-4)  # 0 seen
 
 
 def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def _kernel(
     _move(values4, gradients4, means4, squares4, step4, rate4, rest4, scale, k1, t1, k2, t2, n, columns4, block)
 
 
-def step_triton(slots: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
+def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
     """Do `step_torch` for the five float32 tensors of a field, n rows each, on one CUDA device."""
     n = len(slots[0].values)
     keep1, keep2 = (beta**views for beta in BETAS)

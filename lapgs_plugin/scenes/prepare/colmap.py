@@ -229,7 +229,7 @@ def _run_step(
             while worker.poll() is None:
                 with suppress(subprocess.TimeoutExpired):
                     worker.wait(POLL_SECONDS)
-                seen(min(done(), total), total)
+                seen(min(done(), total - 1), total)  # COLMAP goes on after its last item
         finally:
             worker.kill()
             worker.wait()

@@ -154,3 +154,10 @@ def camera_of(photo: Path) -> tuple[str, ...]:
         values += [inner.get(tag) for tag in (tags.FocalLength, tags.FocalLengthIn35mmFilm)]
         return tuple("" if value is None else str(value).strip("\0 ") for value in values)
     return ("",) * 4
+
+
+def quarter_turns(photo: Path) -> int:
+    """Return the quarter turns clockwise that make a photo upright by EXIF; 0 where it does not tell, or mirrors."""
+    with suppress(Exception), Image.open(photo) as opened:  # as above
+        return {6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 1), 0)
+    return 0

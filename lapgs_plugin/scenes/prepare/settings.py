@@ -26,6 +26,9 @@ class PrepareSettings:
         UserInputError: a value is unknown or out of range.
     """
 
+    max_size: int | None = option(
+        None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
+    )
     matcher: str = option(
         AUTO,
         "Pairs of photos to match. exhaustive: all pairs, for up to a few hundred photos. sequential: neighbours in "
@@ -48,9 +51,6 @@ class PrepareSettings:
         "Fit one camera to all photos, or one to each group of photos with the same EXIF data. Default: one camera if "
         "all photos have the same size and camera.",
         names=("--single-camera/--own-cameras",),
-    )
-    max_size: int | None = option(
-        None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
     )
     masks: Path | None = option(
         None,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pycolmap
@@ -11,15 +13,23 @@ from lapgs_plugin.scenes.images import read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
 from lapgs_plugin.scenes.output import write_model
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import target_name
-from lapgs_plugin.scenes.prepare.undistort import lens_of, move_observations, undistort
+from lapgs_plugin.scenes.prepare.photos import quarter_turns, target_name
+from lapgs_plugin.scenes.prepare.undistort import lens_of, move_observations, turn_pose, undistort
+
+logger = logging.getLogger(__name__)
 
 
 def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
-    """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes."""
+    """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes.
+
+    All are turned upright as EXIF says of most, so that images of one camera keep one size.
+    """
     shutil.rmtree(job.scene, ignore_errors=True)
-    lenses = {key: lens_of(camera, job.settings.max_size) for key, camera in model.cameras.items()}
     images = [image for image in model.images.values() if image.has_pose]
+    ((turns, count),) = Counter(quarter_turns(job.photos / image.name) for image in images).most_common(1)
+    if turns:
+        logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
+    lenses = {key: lens_of(camera, job.settings.max_size, turns) for key, camera in model.cameras.items()}
     masked = job.masks.is_dir()
 
     def write(image: pycolmap.Image) -> None:
@@ -34,12 +44,14 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
 
     job.each_photo("Undistorting", write, images)
     for image in images:
-        move_observations(image, lenses[image.camera_id])
+        lens = lenses[image.camera_id]
+        move_observations(image, lens)
+        turn_pose(image, lens)
         image.name = target_name(image.name)
     for key, lens in lenses.items():
-        camera = model.cameras[key]
-        camera.model, camera.width, camera.height = lens.pinhole.model, lens.pinhole.width, lens.pinhole.height
-        camera.params = list(lens.pinhole.params)
+        camera, turned = model.cameras[key], lens.turned
+        camera.model, camera.width, camera.height = turned.model, turned.width, turned.height
+        camera.params = list(turned.params)
     write_model(model, job.scene / "sparse" / "0")
 
 

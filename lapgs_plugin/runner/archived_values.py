@@ -1,0 +1,81 @@
+"""Compare what a checkout's rasterizer gets for a model with the field that is archived of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.runner.stage_rendering import Captured
+
+SAME_VALUE = 1e-3
+"""Largest relative difference of a value from the archived one: logits and logarithms round to 1e-6."""
+
+NESTED_WORKS = "nested levels work: --hierarchy nested"
+
+ADAPTER_MENDS = "an adapter whose snapshot() returns what is rendered mends it (docs/extending.md)"
+
+NO_RESIDUALS = f"expected the same, to which a residual is added; {ADAPTER_MENDS}, {NESTED_WORKS}"
+
+OF_FIELDS = ("mean", "scal", "rot", "opacit")
+"""Parts of the names of inputs that fields have."""
+
+
+def explain_other_values(adapter: BackboneAdapter, captured: Captured, field: GaussianField) -> str:
+    """Return one line on how the render of a model differs from its archived field; empty if it does not.
+
+    Args:
+        adapter: of the checkout.
+        captured: its rasterizer and the inputs that it got for the model.
+        field: the field that is archived of the model.
+    """
+    found = []
+    if names := " and ".join(_other_values(captured, field)):
+        found.append(f"other {names} than its model has as parameters, from which fields are archived")
+    if names := " and ".join(_values_beside(captured, field)):
+        found.append(f"with {names}, values of each Gaussian that fields do not have")
+    return f"{adapter.profile.source.model[1]}: the checkout renders {', and '.join(found)}" if found else ""
+
+
+def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
+    """Yield what is rendered otherwise than the field has it, activated or as its parameters."""
+    logits = field.opacity_logits[:, None]
+    archived = (
+        ("positions", "means3D", (field.means,)),
+        ("scales", "scales", (field.log_scales.exp(), field.log_scales)),
+        ("opacities", "opacities", (logits.sigmoid(), logits)),
+        ("SH", "shs", (field.sh,)),
+    )
+    inputs = dict(captured.inputs)
+    if isinstance(dc := inputs.get("dc"), Tensor) and isinstance(rest := inputs.get("shs"), Tensor):
+        inputs["shs"] = torch.cat([dc, rest], dim=1)
+    for what, name, values in archived:
+        given = [inputs.get(name)]
+        if what == "opacities" and isinstance(given[0], Tensor):
+            given.append(given[0].clamp(max=1))  # as those above 1 are archived, of which a warning tells
+        if not any(_alike(each, value) for each in given for value in values):
+            yield what
+
+
+def _alike(given: object, value: Tensor) -> bool:
+    """Return whether an input of a rasterizer has the values of a field; True if it cannot be compared."""
+    if not isinstance(given, Tensor) or given.ndim != value.ndim or len(given) != len(value):
+        return True
+    axes = min(given.shape[1], value.shape[1])  # flat Gaussians have two scales, and get a third one in fields
+    value = value.to(given.device)
+    return torch.allclose(given[:, :axes].detach(), value[:, :axes], rtol=SAME_VALUE, atol=SAME_VALUE**2)
+
+
+@torch.no_grad()
+def _values_beside(captured: Captured, field: GaussianField) -> Iterator[str]:
+    """Yield inputs with a value of each Gaussian that the image depends on, such as masks: it is another with ones."""
+    for name, value in captured.inputs.items():
+        if not (isinstance(value, Tensor) and value.is_floating_point() and value.shape[:1] == (len(field),)):
+            continue
+        if value.numel() == len(field) and not any(part in name for part in OF_FIELDS):
+            image, plain = (captured.image(**{name: each}) for each in (value, torch.ones_like(value)))
+            if not torch.allclose(image, plain, rtol=SAME_VALUE, atol=SAME_VALUE):
+                yield name
