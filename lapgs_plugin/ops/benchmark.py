@@ -20,7 +20,7 @@ from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
-from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
@@ -128,15 +128,20 @@ def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | N
     if ours != NUMBA:
         target, coarse = (255 * target).to(torch.uint8), None if coarse is None else coarse.half()
 
-    def in_parts() -> Tensor:
-        image = leaf if coarse is None else leaf + upsample.upsample(pyramid, coarse.float(), size)
-        return photometric_loss_torch(image, photometric_loss.decoded(target))
+    def in_parts(loss: Callable[[Tensor, Tensor, float], Tensor]) -> Callable[[], Tensor]:
+        def composed_loss() -> Tensor:
+            image = leaf if coarse is None else leaf + upsample.upsample(pyramid, coarse.float(), size)
+            return loss(image, photometric_loss.decoded(target), DEFAULT_SSIM_WEIGHT)
+
+        return composed_loss
 
     def whole() -> Tensor:
         image = leaf if coarse is None else upsample.upsample_add(pyramid, coarse, leaf)
         return photometric_loss.photometric_loss(image, target)
 
-    losses = {TORCH: in_parts}
+    losses = {TORCH: in_parts(photometric_loss_torch)}
+    if ours != NUMBA and photometric_loss.fused_ssim() is not None:
+        losses["fused_ssim"] = in_parts(photometric_loss.photometric_loss_fused_ssim)
     if ours == NUMBA or photometric_loss.triton_works():
         losses[ours] = whole
     return {name: Version(partial(_gradient, loss, leaf)) for name, loss in losses.items()}

@@ -62,7 +62,7 @@ def test_damage_is_one_line_for_fields_and_for_points(name: str, tmp_path: Path)
             assert "\n" not in str(caught.value)
             assert str(path) in str(caught.value)
         with pytest.raises(SceneError, match=message) as refused:
-            blender._read_points(tmp_path, {})
+            blender._read_points(tmp_path, "transforms.json", {})
         assert "\n" not in str(refused.value)
         assert tracemalloc.get_traced_memory()[1] < 50 * 2**20  # 3 MiB seen
     finally:
@@ -104,7 +104,7 @@ def test_points_need_numbers(elements: str, message: str, tmp_path: Path) -> Non
     )
     (tmp_path / "points3d.ply").write_bytes(ply(ASCII, f"element vertex 1\n{elements}", f"{row}\n".encode()))
     with pytest.raises(SceneError, match=message):
-        blender._read_points(tmp_path, {})
+        blender._read_points(tmp_path, "transforms.json", {})
 
 
 def test_a_scene_with_damaged_points_is_one_line(tmp_path: Path) -> None:

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
+from importlib import import_module
+
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, check_arguments, photometric_loss_torch
+from lapgs_plugin.ops.photometric_loss.in_torch import (
+    DEFAULT_SSIM_WEIGHT,
+    as_batch,
+    check_arguments,
+    photometric_loss_torch,
+)
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
@@ -13,7 +22,7 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     """Return the loss of 3DGS, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable by the prediction.
 
     On the CPU a fused kernel computes it together with its gradient. On a GPU two Triton kernels do, where they work;
-    else SSIM is kornia's.
+    else SSIM comes from the package `fused_ssim` or from kornia.
 
     Args:
         prediction: (3, h, w), or (b, 3, h, w) of several views; colours in [0, 1], not clamped. Other numbers of
@@ -39,7 +48,18 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
         return photometric_loss_cpu(prediction, target, ssim_weight)
-    return photometric_loss_torch(prediction, target, ssim_weight)
+    fused = fused_ssim()
+    if fused is None or prediction.dtype != torch.float32:
+        return photometric_loss_torch(prediction, target, ssim_weight)
+    return photometric_loss_fused_ssim(prediction, target, ssim_weight)
+
+
+def photometric_loss_fused_ssim(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """Do `photometric_loss` with the package `fused_ssim`, which has to be installed."""
+    fused = fused_ssim()
+    assert fused is not None
+    l1 = (prediction - target).abs().mean()
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(as_batch(prediction), as_batch(target)))
 
 
 def decoded(target: Tensor) -> Tensor:
@@ -62,3 +82,13 @@ def triton_works(device: torch.device) -> float:
     for loss in (photometric_loss_triton(prediction, levels, 0.2), photometric_loss_torch(*exact, 0.2)):
         found.append((loss, torch.autograd.grad(3.0 * loss, prediction)[0] * target.numel()))
     return largest((one - other).abs() for one, other in zip(*found, strict=True))
+
+
+@lru_cache(maxsize=1)
+def fused_ssim() -> Callable[[Tensor, Tensor], Tensor] | None:
+    """Return the function of the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without the package."""
+    try:
+        found: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
+    except ImportError:
+        return None
+    return found
