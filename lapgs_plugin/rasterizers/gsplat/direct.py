@@ -138,11 +138,7 @@ class _Render(torch.autograd.Function):
 
         means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
         given, blended = ToBlend(*rest[:7]), Blended(*rest[7:10])
-        found, (width, height), compiled = (
-            Intermediates(given, blended, *rest[10:]),
-            ctx.size,
-            bindings.compiled_functions(),
-        )
+        found, (width, height) = Intermediates(given, blended, *rest[10:]), ctx.size
         by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
