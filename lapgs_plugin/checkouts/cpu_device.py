@@ -150,7 +150,7 @@ class _Generator(torch.Generator):
     """Stand in for `torch.Generator`, a class, which `_CudaMeansCpu` does not see."""
 
     def __new__(cls, device: Any = "cpu") -> _Generator:
-        return super().__new__(cls, _redirected(device))
+        return super().__new__(cls, _redirected(device))  # type: ignore[call-arg]  # as the class takes it
 
 
 class _Event:
