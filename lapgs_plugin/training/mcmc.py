@@ -10,7 +10,6 @@ import math
 from functools import lru_cache
 
 import torch
-from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
@@ -161,13 +160,18 @@ def shake(model: TrainableField, amount: float) -> None:
         amount: factor on the covariance, times which a standard normal vector is added to a transparent Gaussian.
     """
     means, opacities = model.params["means"], torch.sigmoid(model.params["opacities"])
-    quats, log_scales = model.params["quats"], model.params["scales"]
     rows: Tensor | slice = slice(None)
     if means.device.type == "cpu":  # a GPU would wait for the number of rows
         rows = (opacities < SOLID).nonzero()[:, 0]
     share = torch.sigmoid(SHARPNESS * (FAINT - opacities[rows]))
     noise = torch.randn_like(means[rows]) * (amount * share)[:, None]
-    rotations = normalized_quat_to_rotmat(torch.nn.functional.normalize(quats[rows], dim=-1))
-    axes = rotations * torch.exp(log_scales[rows])[:, None, :]  # (n, 3, 3), one axis a column
-    along = (axes * noise[:, :, None]).sum(1)  # (n, 3) faster than products of small matrices
-    means[rows] += (axes * along[:, None, :]).sum(2)
+    quats = model.params["quats"][rows]
+    means[rows] += _turned(quats, _turned(quats, noise, back=True) * torch.exp(2.0 * model.params["scales"][rows]))
+
+
+def _turned(quaternions: Tensor, vectors: Tensor, *, back: bool = False) -> Tensor:
+    """Rotate vectors (n, 3) by quaternions (n, 4), w first and of any length, or back; matrices would take three times
+    the memory."""
+    real, axis = quaternions[:, :1], quaternions[:, 1:]
+    across = torch.linalg.cross(axis, vectors) * (2.0 / quaternions.square().sum(1, keepdim=True))
+    return vectors + (-real if back else real) * across + torch.linalg.cross(axis, across)
