@@ -22,7 +22,9 @@ def prepare(
     photos: Annotated[
         Path,
         typer.Argument(
-            metavar="PHOTOS", help="Folder of JPEG, PNG, TIFF, BMP, WebP or HEIC photos of a static scene, or a video."
+            metavar="PHOTOS",
+            help="Folder of JPEG, PNG, TIFF, BMP, WebP or HEIC photos of a static scene, a video, or a scene folder of "
+            "COLMAP or nerfstudio, whose cameras are kept.",
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write.")],
@@ -34,8 +36,8 @@ def prepare(
 ) -> None:
     """Make a scene from photos or a video: recover cameras and points with COLMAP, then undistort the photos.
 
-    OUT becomes a COLMAP scene with PINHOLE cameras, which `lapgs train` and every 3DGS codebase read. Repeat the
-    command to continue an interrupted run.
+    OUT becomes a COLMAP scene with PINHOLE cameras, which `lapgs train` and every 3DGS codebase read. A scene whose
+    cameras are known but distorted is only undistorted. Repeat the command to continue an interrupted run.
     """
     import logging
 
@@ -47,9 +49,9 @@ def prepare(
     advise(f"{out} keeps the finished steps, repeat the command to continue")
     result = prepare_scene(photos, out, settings, overwrite=overwrite)
     total = len(result.registered) + len(result.left_out)
+    error = f"mean reprojection error {result.reprojection_error:.2f} pixels, " if result.reprojection_error else ""
     typer.echo(
-        f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, "
-        f"mean reprojection error {result.reprojection_error:.2f} pixels, "
+        f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, {error}"
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
     typer.echo(f"next: {_next_command(out, result.registered)}")

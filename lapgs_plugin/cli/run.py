@@ -17,7 +17,7 @@ from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runner.settings import RunSettings
-from lapgs_plugin.runs.options import MeasuringOptions
+from lapgs_plugin.runs.options import PANEL, MeasuringOptions
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
@@ -38,6 +38,9 @@ class ScriptOptions:
         UserInputError: the device is unknown, or an option has no effect with the others.
     """
 
+    resume: bool = option(False, "Continue the run in -m after its last finished level. Repeat its other options.")
+    overwrite: bool = option(False, "Replace the run in -m.")
+    viewing: ViewOptions = field(default_factory=ViewOptions)
     off: bool = option(False, "Run the script unchanged, without a hierarchy.")
     record: bool = option(
         False, "With --off: record time, Gaussians, memory and held-out PSNR of the unchanged run in its -m folder."
@@ -53,10 +56,9 @@ class ScriptOptions:
         "else the CPU.",
         choices=("auto", "cuda", "cpu"),
     )
-    resume: bool = option(False, "Continue the run in -m after its last finished level. Repeat its other options.")
-    overwrite: bool = option(False, "Replace the run in -m.")
-    viewing: ViewOptions = field(default_factory=ViewOptions)
-    verbose: bool = option(False, "Log which symbols are replaced, and where they are used.", names=("--verbose", "-v"))
+    verbose: bool = option(
+        False, "Log which symbols are replaced, and where they are used.", panel=PANEL, names=("--verbose", "-v")
+    )
 
     def __post_init__(self) -> None:
         check_values(self)
@@ -72,8 +74,8 @@ def run(
         list[str] | None, typer.Argument(help="Arguments of the script, as without lapgs.", metavar="ARGUMENTS...")
     ] = None,
     *,
-    options: ScriptOptions,
     settings: RunSettings,
+    options: ScriptOptions,
     measuring: MeasuringOptions,
 ) -> None:
     """Train with a 3DGS checkout's own train.py, coarse to fine; its files stay unchanged.

@@ -9,6 +9,9 @@ import typer
 
 from lapgs_plugin.cli.output import train_command
 
+MINUTES_ON_A_CPU = "--iterations 2000"
+"""Options that are proposed: by its number of views the scene would get ten thousand."""
+
 
 def sample(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write. It appears when complete.")],
@@ -31,4 +34,4 @@ def sample(
         out, width=width, height=height, views=views, points=points, seed=seed, overwrite=overwrite, progress=True
     )
     typer.echo(f"{out}: {views} images of {width}x{height}, {points} points")
-    typer.echo(f"next: {train_command(out)}")
+    typer.echo(f"next: {train_command(out, MINUTES_ON_A_CPU)}")

@@ -193,14 +193,7 @@ class StagePlan:
         if split is None:
             middle = (Fraction(1, 3 * max(levels - 2, 1)),) * (levels - 2)
             split = DEFAULT_SPLITS.get(levels, (Fraction(1, 3), *middle, Fraction(1, 3)))
-        if len(split) != levels:
-            raise UserInputError(
-                f"--split has {len(split)} shares, expected {levels}, one for each of the --levels, coarsest first"
-            )
-        if any(share <= 0 for share in split) or sum(split) != 1:
-            raise UserInputError(
-                f"--split {','.join(map(str, split))}: expected positive shares that sum to 1, such as 1/3,2/3"
-            )
+        require_shares(split, levels)
         ends = [round(iterations * sum(split[: i + 1], Fraction(0))) for i in range(levels)]
         counts = [end - start for start, end in zip([0, *ends[:-1]], ends, strict=True)]
         residuals = hierarchy is Hierarchy.LAPLACIAN
@@ -219,6 +212,18 @@ def _require_side(level: int, levels: int, size: tuple[int, int]) -> None:
         raise UserInputError(
             f"level {level} of {levels} would be {size[0]}x{size[1]} pixels, expected at least {MIN_LEVEL_SIDE} on "
             "each side; use fewer --levels or a larger --resolution"
+        )
+
+
+def require_shares(split: Sequence[Fraction], levels: int) -> None:
+    """Raise a UserInputError unless `split` has a positive share for each level, which sum to 1."""
+    if len(split) != levels:
+        raise UserInputError(
+            f"--split has {len(split)} shares, expected {levels}, one for each of the --levels, coarsest first"
+        )
+    if any(share <= 0 for share in split) or sum(split) != 1:
+        raise UserInputError(
+            f"--split {','.join(map(str, split))}: expected positive shares that sum to 1, such as 1/3,2/3"
         )
 
 

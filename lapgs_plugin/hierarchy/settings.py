@@ -8,7 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage
+from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage, require_shares
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import check_values, option, option_name, require_positive
 
@@ -171,7 +171,7 @@ class HierarchySettings:
         if not 0 <= self.seed < 2**32:
             raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
         if self.split is not None:
-            parse_split(self.split)
+            require_shares(parse_split(self.split), self.levels)
         parse_inheritance(self.inherit or DEFAULT_INHERITANCE)
         if not 0.0 <= self.joint_share <= 1.0:
             raise UserInputError(

@@ -140,8 +140,8 @@ def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | N
         return photometric_loss.photometric_loss(image, target)
 
     losses = {TORCH: in_parts(photometric_loss_torch)}
-    if ours != NUMBA and photometric_loss.fused_ssim() is not None:
-        losses["fused_ssim"] = in_parts(photometric_loss.photometric_loss_fused_ssim)
+    if ours != NUMBA and (fused := photometric_loss.fused_ssim()) is not None:
+        losses["fused_ssim"] = in_parts(partial(photometric_loss_torch, mean_ssim=fused))
     if ours == NUMBA or photometric_loss.triton_works():
         losses[ours] = whole
     return {name: Version(partial(_gradient, loss, leaf)) for name, loss in losses.items()}

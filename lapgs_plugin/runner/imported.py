@@ -159,7 +159,7 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
         raise RunFolderError(f"{folder} was trained without --blur_up, expected a run with it: our Up always blurs")
     levels = tuple(_level(level, trained[level], iteration) for level in expected)
     record = {} if is_hierarchy or not exists(folder / BARE_RECORD) else read_bare_record(folder / BARE_RECORD)
-    return ForeignRun(folder, options, levels, _recognised(options, breakdown), record, is_hierarchy)
+    return ForeignRun(folder, options, levels, _recognised(options, record, breakdown), record, is_hierarchy)
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:
@@ -289,13 +289,11 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
     )
 
 
-def _recognised(options: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str | None:
-    """Return the backbone by options that only it has, or as the release noted it; None if neither tells."""
-    for adapter in all_adapters():
-        if any(option in options for option in adapter.info.telling_options):
-            return adapter.info.name
-    noted = breakdown.get("backbone")
-    return noted if noted in list(BACKBONES) else None
+def _recognised(options: Mapping[str, Any], record: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str | None:
+    """Return the backbone as we recorded it, by options that only it has, or as the release noted it; else None."""
+    by_options = [each.info for each in all_adapters() if any(name in options for name in each.info.telling_options)]
+    told = (record.get("backbone"), *(info.name for info in by_options), breakdown.get("backbone"))
+    return next((name for name in told if name in list(BACKBONES)), None)
 
 
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -131,6 +131,7 @@ class BareRunRecorder:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
         record, count = self.record, len(self.gaussians._xyz)
         return {
+            "backbone": self._adapter.info.name,
             "iterations": self.iteration,
             "train_seconds": record.seconds,
             "saving_seconds": record.overhead.get("saving", 0.0),

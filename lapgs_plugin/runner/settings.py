@@ -8,6 +8,7 @@ from typing import Any
 
 from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
 from lapgs_plugin.options import option, require_positive
+from lapgs_plugin.runs.options import PANEL as RUN_PANEL
 
 ELSEWHERE = ("levels", "grid", "supervision", "inherit", "seed", "masks", "dry_run")
 """Settings that a manifest has fields of its own for, and one that changes no result."""
@@ -39,6 +40,7 @@ class RunSettings(HierarchySettings):
     dry_run: bool = option(
         True,
         "Before the first stage, try one iteration of the checkout and everything that the run does with its model.",
+        panel=RUN_PANEL,
         names=("--dry-run/--no-dry-run",),
     )
 

@@ -101,6 +101,7 @@ class Timeline(Strict):
 class BareRecord(Strict):
     """A script's own run without a hierarchy, as `lapgs run --off --record` measures it (`runner.recording`)."""
 
+    backbone: NotRequired[str]
     iterations: PositiveInt
     train_seconds: NonNegativeFloat
     saving_seconds: NonNegativeFloat

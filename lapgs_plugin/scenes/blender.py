@@ -55,6 +55,8 @@ CAPTURE_RADIUS = 1.0
 """The same for a single transforms file, whose photos also show the surroundings."""
 
 Values = dict[str, Any]
+Lenses = dict[Path, tuple[str, Values]]
+"""Camera model and distortion, as a transforms file names them and without zeros, by image."""
 
 
 def has_transforms(path: Path) -> bool:
@@ -62,7 +64,7 @@ def has_transforms(path: Path) -> bool:
     return is_file(path / TRAIN_FILE) or is_file(path / SINGLE_FILE)
 
 
-def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
+def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | None = None) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
     With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file those of its
@@ -74,17 +76,18 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
         path: the scene folder.
         images: folder of the images, replacing the one in `file_path`; "images" keeps it.
         evaluate: hold out views.
+        lenses: receives those of the frames, whose cameras may be distorted then.
 
     Raises:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
     if is_file(path / TRAIN_FILE):
         file, values = TRAIN_FILE, _read_json(path / TRAIN_FILE)
-        train, test = _read_pair(path, values, images, evaluate)
+        train, test = _read_pair(path, values, images, evaluate, lenses)
         radius = OBJECT_RADIUS
     else:
         file, values = SINGLE_FILE, _read_json(path / SINGLE_FILE)
-        frames = _read_frames(path, SINGLE_FILE, values, images)
+        frames = _read_frames(path, SINGLE_FILE, values, images, lenses)
         train, test = hold_out(frames, evaluate, _chosen_for_tests(frames, values))
         radius = CAPTURE_RADIUS
     points, colors = _read_points(path, file, values) or _random_points([*train, *test], radius)
@@ -92,12 +95,12 @@ def read_transforms(path: Path, images: str, evaluate: bool) -> SceneSource:
 
 
 def _read_pair(
-    path: Path, train_values: Values, images: str, evaluate: bool
+    path: Path, train_values: Values, images: str, evaluate: bool, lenses: Lenses | None
 ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    train = _read_frames(path, TRAIN_FILE, train_values, images)
+    train = _read_frames(path, TRAIN_FILE, train_values, images, lenses)
     test: list[Frame] = []
     if is_file(path / TEST_FILE):
-        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images)
+        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images, lenses)
     elif evaluate:
         raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
     return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
@@ -141,7 +144,7 @@ def _read_json(file: Path) -> Values:
     return values
 
 
-def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Frame]:
+def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Lenses | None) -> list[Frame]:
     frames = []
     for index, frame in enumerate(values["frames"]):
         where = f"{path / file}: frame {index}"
@@ -161,7 +164,12 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
                 f"{where} names {image}: no such image; put it there or choose another folder with --images"
             )
         posed = {**values, **frame}
-        _refuse_distortion(posed, where, image.parent)
+        lens = _lens(posed)
+        if lenses is not None:
+            lenses[image] = lens
+        elif lens[0] not in PINHOLE_MODELS or lens[1]:
+            terms = "".join(f", {key} = {value}" for key, value in lens[1].items())
+            raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path)}")
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
         camera = read_camera(posed, where)
@@ -170,14 +178,12 @@ def _read_frames(path: Path, file: str, values: Values, images: str) -> list[Fra
     return frames
 
 
-def _refuse_distortion(values: Values, where: str, photos: Path) -> None:
-    model = values.get("camera_model") or "OPENCV"
+def _lens(values: Values) -> tuple[str, Values]:
+    """Return the camera model of a frame and its distortion, without zeros."""
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
     if np.any(values.get("distortion_params") or 0.0):
         distortion["distortion_params"] = values["distortion_params"]
-    if model not in PINHOLE_MODELS or values.get("is_fisheye") or distortion:
-        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
-        raise SceneError(f"{where} has a distorted camera ({model}{terms}); {undistort_hint(photos)}")
+    return "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model") or "OPENCV", distortion
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:

@@ -5,6 +5,7 @@ The formats are described at https://colmap.github.io/format.html; pycolmap read
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,17 +20,28 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
 from lapgs_plugin.scenes.images import find_image
-from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource, check_camera, hold_out, undistort_hint
+from lapgs_plugin.scenes.source import (
+    PINHOLE_MODELS,
+    Frame,
+    SceneSource,
+    check_camera,
+    hold_out,
+    in_name_order,
+    undistort_hint,
+)
 
 MODEL_FILES = ("cameras", "images", "points3D")
+
+MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0")
+"""Where COLMAP, nerfstudio and the 3DGS repository's convert.py leave models of photos that are not undistorted."""
 
 UNIT_TOLERANCE = 1e-2
 """Largest difference of a quaternion's length from 1; COLMAP writes 17 digits."""
 
 
-def find_model(path: Path) -> Path | None:
-    """Return the folder below `path` that holds files of a COLMAP model; None if there is none."""
-    for folder in (path / "sparse" / "0", path / "sparse"):
+def find_model(path: Path, places: Sequence[str] = MODEL_PLACES[:2]) -> Path | None:
+    """Return the first of these places in `path` that holds files of a COLMAP model; None if there is none."""
+    for folder in (path / place for place in places):
         if any(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES for suffix in ("bin", "txt")):
             return folder
     return None
@@ -47,30 +59,51 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
     Raises:
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
-    reconstruction = _read_model(model)
+    reconstruction = read_model(model)
     folder = path / images
     if not is_folder(folder):
         others = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
         hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
         raise SceneError(f"{folder}: no such folder of images; {hint}")
+    for key in sorted({image.camera_id for image in reconstruction.images.values() if image.has_pose}):
+        _refuse_distortion(reconstruction.cameras[key], model, path)
+    source = source_of(reconstruction, model, folder)
+    train, test = hold_out(source.train, evaluate)
+    return replace(source, train=train, test=test)
+
+
+def source_of(reconstruction: pycolmap.Reconstruction, model: Path, folder: Path) -> SceneSource:
+    """Return frames and points of a model, with pinhole cameras even where the model's are distorted.
+
+    Args:
+        reconstruction: the model, whose cameras are perspective or fisheye.
+        model: its folder.
+        folder: of the images, of which some may be missing.
+
+    Raises:
+        SceneError: it has no points, or a name, a pose or a camera cannot be used.
+    """
     posed = [image for image in reconstruction.images.values() if image.has_pose]
-    used = sorted({image.camera_id for image in posed})
-    cameras = {key: _intrinsics(reconstruction.cameras[key], model, folder) for key in used}
+    cameras = {key: _intrinsics(reconstruction.cameras[key]) for key in {image.camera_id for image in posed}}
     frames = [_frame(model, folder, cameras[image.camera_id], image) for image in posed]
     points = [(point.xyz, point.color) for point in reconstruction.points3D.values()]
     if not points:
         raise SceneError(f"{model}: the model has no 3D points, expected the sparse points of a reconstruction")
-    train, test = hold_out(frames, evaluate)
     return SceneSource(
         "colmap",
-        train,
-        test,
+        in_name_order(frames),
+        (),
         points=np.array([xyz for xyz, _ in points], np.float64),
         colors=np.array([rgb for _, rgb in points], np.float64) / 255.0,
     )
 
 
-def _read_model(model: Path) -> pycolmap.Reconstruction:
+def read_model(model: Path) -> pycolmap.Reconstruction:
+    """Read the COLMAP model in a folder, binary or text.
+
+    Raises:
+        SceneError: it is incomplete or unreadable.
+    """
     suffix = next(
         (s for s in ("bin", "txt") if all(is_file(model / f"{name}.{s}") for name in MODEL_FILES)),
         None,
@@ -96,13 +129,16 @@ def _read_model(model: Path) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def _intrinsics(camera: pycolmap.Camera, model: Path, photos: Path) -> Camera:
-    """Return the camera without a pose."""
+def _refuse_distortion(camera: pycolmap.Camera, model: Path, scene: Path) -> None:
     kind = camera.model.name
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     if kind not in PINHOLE_MODELS or any(distortion):
         values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
-        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {undistort_hint(photos)}")
+        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {undistort_hint(scene)}")
+
+
+def _intrinsics(camera: pycolmap.Camera) -> Camera:
+    """Return the camera without distortion and pose."""
     matrix = camera.calibration_matrix()  # (3, 3)
     return Camera(
         width=camera.width,

@@ -52,9 +52,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     Raises:
         SceneError: an image has no mask, or several.
     """
-    tops = {name[: name.find("/") + 1] for name in names}  # "" of a name without a folder
-    common = tops.pop() if len(tops) == 1 else ""
-    shorter = {name: name.removeprefix(common) for name in names}
+    shorter = {name: name.removeprefix(common_folder(names)) for name in names}
     parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
     places = [place for parent in parents if is_folder(place := folder / parent)]
     files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
@@ -70,6 +68,12 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
             "whole photo), or use no masks (in training: --masks none)"
         )
     return {name: path for name, path in found.items() if path is not None}
+
+
+def common_folder(names: Sequence[str]) -> str:
+    """Return the top folder that all names begin with, with its slash; "" if there is none."""
+    tops = {name[: name.find("/") + 1] for name in names}  # "" of a name without a folder
+    return tops.pop() if len(tops) == 1 else ""
 
 
 def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None:

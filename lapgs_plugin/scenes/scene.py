@@ -18,7 +18,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import find_model, read_colmap
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, missing_image, read_as_3dgs, read_image, same_shape
 from lapgs_plugin.scenes.masks import (
     ALPHA,
@@ -227,12 +227,14 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
         raise SceneError(
             f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; {_what_to_give(path)}"
         )
-    _check_source(path, source)
+    check_source(path, source)
     return source
 
 
 def _what_to_give(path: Path) -> str:
     """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
+    if find_model(path, MODEL_PLACES) is not None:
+        return f"make a scene of its photos and its model with `lapgs prepare {quote(str(path))} OUT`"
     inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
     folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
@@ -244,8 +246,13 @@ def _what_to_give(path: Path) -> str:
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 
-def _check_source(path: Path, source: SceneSource) -> None:
-    """Check frames and points before any image is read."""
+def check_source(path: Path, source: SceneSource) -> None:
+    """Check frames and points before any image is read.
+
+    Raises:
+        SceneError: there are fewer than two training views, an image is missing, listed twice or outside of the scene,
+            or the points cannot be used.
+    """
     frames = [*source.train, *source.test]
     if len(source.train) < 2:
         held_out = f" besides {len(source.test)} held out" if source.test else ""
@@ -280,18 +287,23 @@ def _check_source(path: Path, source: SceneSource) -> None:
 
 def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
     """Return the camera at its training size, after comparing the shapes of model and file."""
-    camera = frame.camera
     width, height = image_size(frame.path)
-    if not same_shape((width, height), camera.size):
-        raise SceneError(
-            f"{frame.path}: the image is {width}x{height} pixels, its camera {camera.width}x{camera.height}; "
-            "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
-        )
+    check_shape(frame, (width, height))
     size = rule.size_for(width, height)
     subject = f"{frame.path}: at --resolution {rule.text} the image has {size[0]}x{size[1]} pixels"
     VIEW_PIXELS.check(size[0] * size[1], subject, "choose a smaller --resolution", SceneError)
-    resized = camera.resized(*size).to(dtype=torch.float32)
+    resized = frame.camera.resized(*size).to(dtype=torch.float32)
     return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if rule.backbone is not None else resized
+
+
+def check_shape(frame: Frame, size: tuple[int, int]) -> None:
+    """Raise a SceneError if an image file of this width and height is no copy of what its camera took."""
+    if not same_shape(size, frame.camera.size):
+        width, height = frame.camera.size
+        raise SceneError(
+            f"{frame.path}: the image is {size[0]}x{size[1]} pixels, its camera {width}x{height}; "
+            "expected the same aspect ratio, use the images the scene was made from, neither cropped nor rotated since"
+        )
 
 
 def _extent(path: Path, train: Sequence[Frame]) -> float:

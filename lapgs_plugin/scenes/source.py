@@ -62,12 +62,9 @@ class SceneSource:
     colors: NDArray[np.float64]  # (n, 3)
 
 
-def undistort_hint(photos: Path) -> str:
-    """Return what to do about distorted photos in a folder."""
-    return (
-        f"only pinhole images can be trained on; `lapgs prepare {quote(str(photos))} OUT` undistorts photos, as does "
-        "COLMAP's image_undistorter"
-    )
+def undistort_hint(scene: Path) -> str:
+    """Return what to do about distorted cameras of a scene."""
+    return f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`"
 
 
 def check_camera(who: str, camera: Camera) -> None:

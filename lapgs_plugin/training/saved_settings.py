@@ -9,6 +9,7 @@ from typing_extensions import NotRequired
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Hierarchy
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.training.settings import IN_MANIFEST, LAST, OFF, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, STRATEGIES
 from lapgs_plugin.untrusted import StrictWithMore, checked
@@ -44,6 +45,7 @@ def settings_from_manifest(manifest: Manifest, name: str = "the run's manifest")
     checked(values, _OldSettings, name, error=RunFolderError, advice=advice)
     try:
         values, options = _of_this_version(values)
+        SUPERVISIONS[values["supervision"]]
     except UserInputError as error:
         raise RunFolderError(f"{name}: {error}; install the package that brings it") from error
     values.pop("raster", None)  # `antialiased` says it

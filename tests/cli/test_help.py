@@ -76,3 +76,11 @@ def test_paragraphs_fill_the_lines_of_a_terminal_and_examples_take_one_each(word
         for line, following in pairwise(lines):
             assert "lapgs " not in line[:6], f"an example that does not fit: {line} {following}"
             assert len(line) + 1 + len(following.split()[0]) > 78, line
+
+
+def test_options_that_train_and_run_share_come_in_the_same_order() -> None:
+    commands: Any = typer.main.get_command(app)
+    train, run = ([option.name for option in commands.commands[name].params] for name in ("train", "run"))
+    shared = [name for name in train if name in run]
+    assert "resume" in shared
+    assert [name for name in run if name in train] == shared

@@ -22,6 +22,7 @@ from lapgs_plugin.cli.render import render
 from lapgs_plugin.cli.report import report
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runs.archive import RunArchive
@@ -209,6 +210,11 @@ def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
     manifest = RunArchive.open(foreign.folder / "lapgs").manifest
     assert manifest.settings["backbone"]["name"] == "graphdeco"
     assert manifest.settings["raster"] == {"antialiasing": True}
+    noted = {"iterations": 30, "num_gaussians": 8, "peak_gaussians": 8, "mean_gaussians": 8.0, "memory_bytes": {}}
+    noted |= {"backbone": "fastgs", "train_seconds": 5.0, "saving_seconds": 0.0, "timeline": []}
+    (foreign.folder / BARE_RECORD).write_text(json.dumps(noted))
+    lapgs("import-run", foreign.folder, "--overwrite")
+    assert RunArchive.open(foreign.folder / "lapgs").manifest.settings["backbone"]["name"] == "fastgs"
 
 
 @pytest.mark.parametrize(

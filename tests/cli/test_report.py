@@ -156,14 +156,18 @@ def test_charts_show_both_runs_over_time_and_iterations(run: Path, baseline: Pat
 
 def test_bars_show_the_time_of_training(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
-    page = Page((run / "report.html").read_text())
-    bars = Counter(bar["class"] for bar in page.all("rect") if bar.get("class", "").startswith("part-"))
-    recorded = {"part-forward": 3, "part-loss": 3, "part-backward": 3, "part-other": 3}  # three stages of two runs
-    beside = {"part-pyramid": 2, "part-cache": 1, "part-archive": 2}
-    assert bars == {**recorded, **beside}
+    text = (run / "report.html").read_text()
+    page, bars = Page(text), re.findall(r'<title>(\w+): .*</title>\s*<rect class="(part-\d)".* width="(.*?)"', text)
+    recorded = {"forward": 3, "loss": 3, "backward": 3, "other": 3}  # three stages of two runs
+    beside = {"pyramid": 2, "cache": 1, "archive": 2}
+    assert Counter(name for name, _, _ in bars) == {**recorded, **beside}
+    for parts in (recorded, beside):
+        styles = {(name, style) for name, style, _ in bars if name in parts}
+        colours = {re.findall(rf"\.{style} {{ fill: (#\w+)", text)[0] for _, style in styles}
+        assert len(styles) == len(colours) == len(parts), "each part has a colour of its own in its chart"
     assert "hierarchy, level 1: 35 ms an iteration" in page.text
     assert "plain: 41.2 ms an iteration" in page.text
-    widths = [float(bar["width"]) for bar in page.all("rect") if bar.get("class") == "part-backward"]
+    widths = [float(width) for name, _, width in bars if name == "backward"]
     assert widths[0] / widths[1] == pytest.approx(1.75 / 3.25, rel=0.01)  # 3.0e-4 seen
 
 

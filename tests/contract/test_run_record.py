@@ -64,6 +64,7 @@ def test_a_recorded_run_is_the_bare_run_to_the_bit(
 
     values = json.loads((recorded.folder / BARE_RECORD).read_text())
     last = recorded.folder / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
+    assert values["backbone"] == name
     assert values["num_gaussians"] == count_gaussians(last)
     assert values["iterations"] == ITERATIONS
     assert [entry["iteration"] for entry in values["timeline"]] == list(range(1, ITERATIONS + 1))

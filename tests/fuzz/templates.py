@@ -221,7 +221,7 @@ def _write_foreign(folder: Path) -> None:
     noted = {
         **{"train_seconds": 5.0, "peak_gaussians": 9, "mean_gaussians": 8.0, "iterations": 30, "saving_seconds": 0.5},
         **{"num_gaussians": 8, "timeline": [{"iteration": 10, "elapsed": 1.0, "num_gaussians": 8}]},
-        **{"memory_bytes": {"peak": 100, "images": 10}},
+        **{"memory_bytes": {"peak": 100, "images": 10}, "backbone": "graphdeco"},
     }
     (folder / "foreign" / BARE_RECORD).write_text(as_json(noted))
 

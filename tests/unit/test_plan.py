@@ -138,6 +138,9 @@ def test_a_level_that_the_plan_lacks_has_no_stage() -> None:
 def test_parse_split() -> None:
     assert parse_split("1/3, 2/3") == (Fraction(1, 3), Fraction(2, 3))
     assert parse_split("0.25,0.75") == (Fraction(1, 4), Fraction(3, 4))
+    for split, message in (("1/3,1/3", "sum to 1"), ("1/3,1/3,1/3", "3 shares, expected 2")):
+        with pytest.raises(UserInputError, match=message):
+            HierarchySettings(split=split)  # before a scene is read
     for text in ("", "a,b", "1/0", "1/3;2/3", "1e999999999,1/2", "1E-999999999"):
         with pytest.raises(UserInputError, match="--split"):
             parse_split(text)

@@ -389,6 +389,7 @@ def test_command_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "2 images of 64x48, 10 points" in result.output
+    assert "--eval --iterations 2000" in result.output, "minutes on a CPU; without a number it would take 10,500"
     assert load_scene(tmp_path / "scene", progress=False).train[0].image.shape == (3, 48, 64)
     refused = CliRunner().invoke(app, [str(tmp_path / "other"), "--size", "640"])
     assert isinstance(refused.exception, UserInputError)

@@ -327,7 +327,7 @@ def refused(path: Path, message: str, **options: Any) -> None:
     [
         ({"k1": 0.02, "p2": -1e-4}, r"distorted camera \(OPENCV, k1 = 0.02, p2 = -0.0001\).*`lapgs prepare"),
         ({"camera_model": "OPENCV_FISHEYE"}, r"distorted camera \(OPENCV_FISHEYE\).*`lapgs prepare"),
-        ({"is_fisheye": True}, r"distorted camera \(OPENCV\).*`lapgs prepare"),
+        ({"is_fisheye": True}, r"distorted camera \(OPENCV_FISHEYE\).*`lapgs prepare"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 0}, "intrinsics that are no numbers"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": np.pi}, "focal length of .* expected more than a thousandth"),

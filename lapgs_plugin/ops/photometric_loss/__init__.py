@@ -11,9 +11,9 @@ from torch import Tensor
 
 from lapgs_plugin.ops.photometric_loss.in_torch import (
     DEFAULT_SSIM_WEIGHT,
-    as_batch,
     check_arguments,
     photometric_loss_torch,
+    ssim,
 )
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
@@ -48,18 +48,8 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
         return photometric_loss_cpu(prediction, target, ssim_weight)
-    fused = fused_ssim()
-    if fused is None or prediction.dtype != torch.float32:
-        return photometric_loss_torch(prediction, target, ssim_weight)
-    return photometric_loss_fused_ssim(prediction, target, ssim_weight)
-
-
-def photometric_loss_fused_ssim(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Do `photometric_loss` with the package `fused_ssim`, which has to be installed."""
-    fused = fused_ssim()
-    assert fused is not None
-    l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - fused(as_batch(prediction), as_batch(target)))
+    fused = fused_ssim() if prediction.dtype == torch.float32 else None
+    return photometric_loss_torch(prediction, target, ssim_weight, fused or ssim)
 
 
 def decoded(target: Tensor) -> Tensor:

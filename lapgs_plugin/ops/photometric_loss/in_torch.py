@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from torch import Tensor
 from torch.nn.functional import pad
@@ -20,12 +21,6 @@ SSIM_WINDOW = tuple(each / math.fsum(_gauss) for each in _gauss)
 """The window along one side."""
 
 
-def photometric_loss_torch(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
-    """Do `photometric_loss` on any device."""
-    l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(prediction, target))
-
-
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """Return the mean structural similarity as 3DGS computes it, a differentiable scalar, 1 for equal images.
 
@@ -33,6 +28,17 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         prediction, target: (3, h, w), any float type; or (b, 3, h, w), whose mean is that of all images.
     """
     return ssim_map(as_batch(prediction), as_batch(target)).mean()
+
+
+def photometric_loss_torch(
+    prediction: Tensor,
+    target: Tensor,
+    ssim_weight: float = DEFAULT_SSIM_WEIGHT,
+    mean_ssim: Callable[[Tensor, Tensor], Tensor] = ssim,
+) -> Tensor:
+    """Do `photometric_loss` on any device, with a function of the mean SSIM of two images (b, c, h, w)."""
+    l1 = (prediction - target).abs().mean()
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - mean_ssim(as_batch(prediction), as_batch(target)))
 
 
 def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:

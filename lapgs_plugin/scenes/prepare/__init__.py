@@ -1,4 +1,4 @@
-"""Make a scene from photos or a video: structure from motion and undistortion with pycolmap.
+"""Make a scene from photos or a video: structure from motion, unless there is a model, and undistortion with pycolmap.
 
 OUT/images/            undistorted photos under their own names
 OUT/masks/             undistorted masks, if there are any

@@ -57,13 +57,13 @@ def make_masks(job: Job) -> None:
         return
     given = job.settings.masks
     files = {} if given is None else _given_masks(job, given)
-    if not files and not any(has_alpha(job.photos / name) for name in job.names):
+    if not files and not any(has_alpha(job.photo(name)) for name in job.names):
         return
     partial = job.work / "masks.partial"
     shutil.rmtree(partial, ignore_errors=True)
 
     def make(name: str) -> bool:
-        photo = job.photos / name
+        photo = job.photo(name)
         width, height = image_size(photo)
         mask = read_mask(files[name], (width, height), (width, height)) if files else alpha_mask(photo, (width, height))
         write_mask(partial / f"{name}.png", torch.ones(1, height, width) if mask is None else mask)
@@ -77,7 +77,7 @@ def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
     """Return the mask of each photo by COLMAP's name. That of a.heic is named after it, not after its JPEG."""
     found = job.found
     own = {name: name for name in job.names}
-    own |= {name: path.relative_to(found.folder).as_posix() for name, path in found.files.items()}
+    own |= {name: found.files[name].relative_to(found.folder).as_posix() for name in found.converted}
     masks = find_masks(folder, list(own.values()))
     # The user's files: those beside HEIC and WebP photos are read from copies.
     refuse_photos(masks, {photo: found.files.get(name, job.photos / name) for name, photo in own.items()})
@@ -90,9 +90,7 @@ def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
     refused: dict[str, SceneError] = {}
 
     def size(name: str) -> tuple[int, int]:
-        photo = job.photos / name
-        if name not in job.found.converted:
-            photo = job.found.files.get(name, photo)  # errors name the user's file, not our copy
+        photo = job.photo(name)
         try:
             width, height = check_image(photo)
             share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))

@@ -58,6 +58,11 @@ class Job:
             return tuple(self.found.files)
         return tuple(sorted(file.name for file in self.photos.iterdir()))
 
+    def photo(self, name: str) -> Path:
+        """Return the file of a photo: the user's, which errors should name, or what COLMAP reads instead."""
+        made = self.found.clip is not None or name in self.found.converted
+        return self.photos / name if made else self.found.files[name]
+
     @property
     def masks(self) -> Path:
         """Folder of the masks, which is missing without any."""

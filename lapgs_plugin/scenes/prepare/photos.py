@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from PIL import ExifTags, Image
@@ -31,16 +31,13 @@ class Photos:
         folder: of the files.
         files: by the name that COLMAP gets, sorted: relative to the folder; of HEIC and WebP photos that of their JPEG.
         clip: the video, if frames are to be picked from one; `files` is empty then.
+        converted: names of the photos that COLMAP does not read.
     """
 
     folder: Path
     files: dict[str, Path]
     clip: Path | None = None
-
-    @cached_property
-    def converted(self) -> tuple[str, ...]:
-        """Names of the photos that COLMAP does not read."""
-        return tuple(name for name, path in self.files.items() if _kind(path) in CONVERTED)
+    converted: tuple[str, ...] = ()
 
     @property
     def made(self) -> bool:
@@ -85,15 +82,20 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     if others:
         left = [file.name for file in present if file not in chosen]
         logger.warning("not photos, left out: %s", listed(left))
-    files: dict[str, Path] = {}
-    by_target: dict[str, Path] = {}
-    for file in chosen:
-        place = file.relative_to(source)
-        name = (place.with_suffix(".jpg") if _kind(file) in CONVERTED else place).as_posix()
+    converted = {file for file in chosen if _kind(file) in CONVERTED}
+    places = [(file.relative_to(source), file) for file in chosen]
+    names = [(place.with_suffix(".jpg") if file in converted else place).as_posix() for place, file in places]
+    check_targets(source, list(zip(names, (place for place, _ in places), strict=True)))
+    files = dict(sorted(zip(names, chosen, strict=True)))
+    return Photos(source, files, converted=tuple(name for name, file in files.items() if file in converted))
+
+
+def check_targets(source: Path, photos: Sequence[tuple[str, str | Path]]) -> None:
+    """Raise a SceneError if two of the photos, name and place of each, would have the same name in the scene."""
+    by_target: dict[str, str | Path] = {}
+    for name, place in photos:
         if (other := by_target.setdefault(target_name(name), place)) != place:
             raise SceneError(f"{source}: {other} and {place} would both become {target_name(name)}; rename one of them")
-        files[name] = file
-    return Photos(source, dict(sorted(files.items())))
 
 
 def _kind(photo: Path) -> str:
@@ -108,9 +110,9 @@ def _kind(photo: Path) -> str:
 
 
 def target_name(name: str) -> str:
-    """Return the name of the undistorted image: JPEG stays JPEG, all else becomes PNG."""
+    """Return the name of the undistorted image: JPEG and EXR stay, all else becomes PNG."""
     path = Path(name)
-    return name if path.suffix.lower() in (".jpg", ".jpeg") else path.with_suffix(".png").as_posix()
+    return name if path.suffix.lower() in (".jpg", ".jpeg", ".exr") else path.with_suffix(".png").as_posix()
 
 
 def listed(names: list[str]) -> str:

@@ -14,6 +14,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import option_values
 from lapgs_plugin.scenes.output import check_output, writing_explained
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
+from lapgs_plugin.scenes.prepare.given import Given, find_given, read_given
 from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
 from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
 from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
@@ -34,7 +35,8 @@ class PrepareResult:
         left_out: names of the other photos, sorted.
         parts: number of separate models; the scene is the largest one.
         points: number of sparse points.
-        reprojection_error: mean reprojection error in pixels of the photos before undistortion.
+        reprojection_error: mean reprojection error in pixels of the photos before undistortion; 0 if a model that was
+            given does not tell.
         seconds: wall time of each step by name, without the steps that an interrupted run had finished.
     """
 
@@ -56,12 +58,15 @@ def prepare_scene(
 ) -> PrepareResult:
     """Find features, match them, recover cameras and points, and write undistorted photos with a PINHOLE model.
 
+    Photos with a model, of COLMAP or in a transforms file, are only undistorted.
+
     Call it again with the same photos and settings to continue an interrupted call. On one machine, photos with fewer
     than 25,000 features in total give the same scene each time. With more features, the timing of COLMAP's threads
     decides which photos it starts from and in which order it sums. COLMAP's GPU code is used if pycolmap has it.
 
     Args:
-        photos: folder of at least 2 JPEG, PNG, TIFF, BMP, WebP or HEIC files, also in subfolders; or a video.
+        photos: folder of at least 2 JPEG, PNG, TIFF, BMP, WebP or HEIC files, also in subfolders; or a video; or the
+            folder of a model and its photos.
         out: the scene folder; new, empty, with unfinished work, or with `overwrite` a scene.
         settings: of the user; None takes the defaults.
         overwrite: replace the scene in `out`, and discard unfinished work of other photos or settings.
@@ -74,8 +79,15 @@ def prepare_scene(
         MissingExtraError: a package that reads videos or HEIC photos is missing.
     """
     settings = settings or PrepareSettings()
+    _check_folders(photos, out, settings, overwrite)
+    if (place := find_given(photos, settings)) is not None:
+        return _undistort(read_given(place, photos, settings), out, overwrite, progress)
     require_colmap_for(settings)
-    found = _checked_photos(photos, out, settings, overwrite)
+    found = find_photos(photos, settings.masks)
+    if settings.frames is not None and found.clip is None:
+        raise UserInputError(
+            f"--frames {settings.frames}: it picks frames from a video, and {photos} is a folder; leave it out"
+        )
     with writing_explained(out):
         job = Job(out / WORK, found, settings, progress)
         with opened_work(job.work, _identity(found, settings), overwrite):
@@ -91,30 +103,40 @@ def prepare_scene(
     return result
 
 
-def _checked_photos(photos: Path, out: Path, settings: PrepareSettings, overwrite: bool) -> Photos:
-    """Return the photos, after checks of the folders and of options that depend on them."""
+def _undistort(given: Given, out: Path, overwrite: bool, progress: bool) -> PrepareResult:
+    """Write the scene of a model that was there before."""
+    model, registered = given.model, tuple(frame.name for frame in given.frames)
+    points, error = model.num_points3D(), model.compute_mean_reprojection_error()
+    with writing_explained(out):
+        job = Job(out / WORK, given.photos, given.settings, progress)
+        with opened_work(job.work, _identity(given.photos, given.settings), overwrite):
+            given.check_sizes(read_sizes(job))
+            make_masks(job)
+            write_scene(job, model)
+        move_into_place(job.work, out)
+    return PrepareResult(registered, given.left_out, 1, points, error, job.seconds)
+
+
+def _check_folders(photos: Path, out: Path, settings: PrepareSettings, overwrite: bool) -> None:
     source, target = photos.resolve(), out.resolve()
     if source.is_relative_to(target) or target.is_relative_to(source):
         raise UserInputError(f"{out}: one of {photos} and {out} lies in the other; write OUT somewhere else")
     check_output(out, overwrite, WORK)
-    masks, frames = settings.masks, settings.frames
-    if masks is not None and not masks.is_dir():
-        raise UserInputError(f"--masks {masks}: no such folder of masks; leave it out to use the whole photos")
-    found = find_photos(photos, masks)
-    if frames is not None and found.clip is None:
-        raise UserInputError(f"--frames {frames}: it picks frames from a video, and {photos} is a folder; leave it out")
-    return found
+    if settings.masks is not None and not settings.masks.is_dir():
+        raise UserInputError(f"--masks {settings.masks}: no such folder of masks; leave it out to use the whole photos")
 
 
 def _identity(found: Photos, settings: PrepareSettings) -> dict[str, Any]:
     """Return what unfinished work must agree with to be continued, as JSON: the files, the options, the version."""
     files = {found.clip.name: found.clip} if found.clip is not None else found.files
     stats = {name: path.stat() for name, path in files.items()}
-    options = {f"--{name.replace('_', '-')}": value for name, value in option_values(settings).items()}
+    options = {
+        f"--{name.replace('_', '-')}": str(value.absolute()) if isinstance(value, Path) else value
+        for name, value in option_values(settings).items()
+    }
     return {
         "photos": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()},
         **options,
-        "--masks": None if settings.masks is None else str(settings.masks.absolute()),
         "pycolmap": pycolmap.__version__,
     }
 

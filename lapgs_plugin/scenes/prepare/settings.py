@@ -26,6 +26,11 @@ class PrepareSettings:
         UserInputError: a value is unknown or out of range.
     """
 
+    model: Path | None = option(
+        None,
+        "Folder of a COLMAP model of the photos, such as sparse/0: take its cameras and only undistort. Default: the "
+        "model in PHOTOS, if there is one.",
+    )
     max_size: int | None = option(
         None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
     )

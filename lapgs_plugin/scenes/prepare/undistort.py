@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pycolmap
@@ -14,12 +16,12 @@ QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Rotation of a camera that turns its image clockwise."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lens:
     """Hold the cameras of a photo from its recovery to the scene.
 
     Attributes:
-        recovered: of the photo.
+        recovered: of the photo, as in the model.
         resized: the same at the size of the scene's images.
         pinhole: without distortion.
         turns: quarter turns clockwise by which the scene's images are turned then.
@@ -40,27 +42,39 @@ class Lens:
         return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy])
 
 
-def lens_of(camera: pycolmap.Camera, max_size: int | None, turns: int) -> Lens:
-    """Return the lens of a camera, with images of at most `max_size` pixels a side; `turns` as in `Lens`."""
+def lens_of(camera: pycolmap.Camera, photo: tuple[int, int], max_size: int | None, turns: int) -> Lens:
+    """Return the lens of a camera.
+
+    Args:
+        camera: of the model.
+        photo: width and height of its photos, which may be smaller copies.
+        max_size: longest side of the images of the scene; None keeps the photos' size.
+        turns: as in `Lens`.
+    """
     resized = pycolmap.Camera(camera.todict())
-    longest = max(camera.width, camera.height)
-    if max_size is not None and max_size < longest:
-        resized.rescale(*(max(1, round(side * max_size / longest)) for side in (camera.width, camera.height)))
+    share = min(1.0, (max_size or math.inf) / max(photo))
+    size = tuple(max(1, round(side * share)) for side in photo)
+    if size != (camera.width, camera.height):
+        resized.rescale(*size)
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), resized)
     return Lens(pycolmap.Camera(camera.todict()), resized, pinhole, turns)
 
 
 def undistort(photo: Tensor, lens: Lens) -> Tensor:
     """Resample a photo (3, h, w) of the resized camera to the pinhole camera and turn it, (3, h', w')."""
+    # pycolmap's own warp works in 8 bits and leaves border pixels black.
+    straight = torch.nn.functional.grid_sample(photo[None], _grid(lens), "bicubic", "border", align_corners=False)[0]
+    return torch.rot90(straight, -lens.turns, (1, 2))
+
+
+@lru_cache(maxsize=1)  # most scenes have one camera, and a grid takes more memory than its photo
+def _grid(lens: Lens) -> Tensor:
+    """Return where the pixels of the pinhole camera are in the resized one's image, (1, h', w', 2) in [-1, 1]."""
     width, height = lens.pinhole.width, lens.pinhole.height
     rows, columns = np.mgrid[:height, :width] + 0.5  # pixel centres
     source = _through(lens.pinhole, lens.resized, np.stack([columns.ravel(), rows.ravel()], axis=1))  # (h' w', 2)
     grid = torch.from_numpy(source / (lens.resized.width, lens.resized.height) * 2.0 - 1.0).float()
-    # pycolmap's own warp works in 8 bits and leaves border pixels black.
-    straight = torch.nn.functional.grid_sample(
-        photo[None], grid.reshape(1, height, width, 2), "bicubic", "border", align_corners=False
-    )[0]
-    return torch.rot90(straight.clamp(0.0, 1.0), -lens.turns, (1, 2))
+    return grid.reshape(1, height, width, 2)
 
 
 def _through(seen_by: pycolmap.Camera, other: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

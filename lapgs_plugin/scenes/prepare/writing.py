@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
-from lapgs_plugin.scenes.images import read_image, write_image
+from lapgs_plugin.scenes.images import image_size, read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
 from lapgs_plugin.scenes.output import write_model
 from lapgs_plugin.scenes.prepare.job import Job
@@ -25,17 +25,19 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     All are turned upright as EXIF says of most, so that images of one camera keep one size.
     """
     shutil.rmtree(job.scene, ignore_errors=True)
+    model.tear_down()  # of cameras without photos
     images = [image for image in model.images.values() if image.has_pose]
-    ((turns, count),) = Counter(quarter_turns(job.photos / image.name) for image in images).most_common(1)
+    ((turns, count),) = Counter(quarter_turns(job.photo(image.name)) for image in images).most_common(1)
     if turns:
         logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
-    lenses = {key: lens_of(camera, job.settings.max_size, turns) for key, camera in model.cameras.items()}
+    sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}
+    lenses = {key: lens_of(camera, sizes[key], job.settings.max_size, turns) for key, camera in model.cameras.items()}
     masked = job.masks.is_dir()
 
     def write(image: pycolmap.Image) -> None:
         lens = lenses[image.camera_id]
         size, target = (lens.resized.width, lens.resized.height), target_name(image.name)
-        photo = read_image(job.photos / image.name, size=size, clamp=False)
+        photo = read_image(job.photo(image.name), size=size, clamp=False)
         write_image(job.scene / "images" / target, undistort(photo, lens))
         if not masked:
             return

@@ -1,0 +1,198 @@
+"""Take the cameras of a model that is there, of COLMAP or in a transforms file, so that photos are only undistorted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+
+from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.files import is_file
+from lapgs_plugin.options import option_name
+from lapgs_plugin.scenes.blender import Lenses, has_transforms, read_transforms
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_model, source_of
+from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
+from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
+from lapgs_plugin.scenes.prepare.settings import PrepareSettings
+from lapgs_plugin.scenes.scene import check_shape, check_source
+from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource
+
+FOLDERS = (".", "images", "input")
+"""Where the photos of these models are."""
+USED = ("max_size", "masks", "model")
+"""Settings that concern undistortion."""
+OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3")
+FISHEYE, FISHEYE_TERMS = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")
+"""Distortion in transforms files. nerfstudio's k4 of other lenses is not OpenCV's."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Given:
+    """Hold a model and its photos.
+
+    Attributes:
+        model: with poses of the photos that are there.
+        frames: these photos, with pinhole cameras of the model's size.
+        photos: their files.
+        left_out: names of the model's other photos, sorted.
+        settings: the user's, with the model and the masks that were found.
+    """
+
+    model: pycolmap.Reconstruction
+    frames: tuple[Frame, ...]
+    photos: Photos
+    left_out: tuple[str, ...]
+    settings: PrepareSettings
+
+    def check_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> None:
+        """Raise a SceneError if photos, of these widths and heights by name, are not those of their cameras."""
+        first: dict[int, tuple[int, int]] = {}
+        cameras = {image.name: image.camera_id for image in self.model.images.values()}
+        for frame in self.frames:
+            size = sizes[frame.name]
+            check_shape(frame, size)
+            if (other := first.setdefault(cameras[frame.name], size)) != size:
+                raise SceneError(
+                    f"{frame.path}: {size[0]}x{size[1]} pixels, and other photos of its camera {other[0]}x{other[1]}; "
+                    "expected one size, make these copies again"
+                )
+
+
+def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
+    """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
+
+    Raises:
+        UserInputError: --model names none.
+    """
+    if settings.model is None:
+        return find_model(photos, MODEL_PLACES) or (photos if has_transforms(photos) else None)
+    if (found := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
+        raise UserInputError(
+            f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and points3D"
+        )
+    return found
+
+
+def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
+    """Read a model and find its photos.
+
+    Args:
+        place: from `find_given`.
+        photos: folder of the photos, or of the whole scene.
+        settings: of the user.
+
+    Raises:
+        SceneError: the model cannot be read or undistorted, or its photos are not there.
+        UserInputError: nothing is distorted, or an option is about the search for cameras.
+    """
+    for field in fields(settings):
+        if field.name not in USED and getattr(settings, field.name) != field.default:
+            raise UserInputError(
+                f"{option_name(field)}: {place} has the cameras already; leave the option out, or give a folder of "
+                "photos without a model"
+            )
+    if find_model(place, (".",)) is not None:
+        model = _without_rigs(read_model(place))
+        model.tear_down()  # of images without a pose, and cameras without images
+        _check_lenses(model, place)
+        source = source_of(model, place, photos)
+        folder = max((photos / name for name in FOLDERS), key=lambda folder: _present(source, folder))
+        frames = [replace(frame, path=find_image(folder / frame.name)) for frame in source.train]
+    else:
+        lenses: Lenses = {}
+        source, folder = read_transforms(photos, "images", False, lenses), photos
+        top = common_folder([frame.name for frame in source.train])
+        frames = [replace(frame, name=frame.name.removeprefix(top)) for frame in source.train]
+        model = _model_of(replace(source, train=tuple(frames)), lenses)
+        _check_lenses(model, place)
+    kinds = {camera.model.name for camera in model.cameras.values()}
+    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}:
+        raise UserInputError(
+            f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
+            "cameras again, give a folder of photos without a model"
+        )
+    there = tuple(frame for frame in frames if is_file(frame.path))
+    left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
+    if frames and not there:
+        raise SceneError(
+            f"{folder}: none of the {len(frames)} photos of {place} is there, the first is {printable(left_out[0])}; "
+            "give the folder of the photos, and the model with --model"
+        )
+    check_source(photos, replace(source, train=there))
+    check_targets(photos, [(frame.name, frame.name) for frame in there])
+    if left_out:
+        logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
+    frame_of = {image.name: image.frame_id for image in model.images.values()}
+    for name in left_out:
+        model.deregister_frame(frame_of[name])
+    logger.info("%s: the cameras are taken from it", place)
+    masks = settings.masks
+    if masks is None and (found := resolve_masks(photos, AUTO)) != NONE:
+        masks = photos / found
+    files = {frame.name: frame.path for frame in there}
+    return Given(model, there, Photos(folder, files), tuple(left_out), replace(settings, masks=masks, model=place))
+
+
+def _present(source: SceneSource, folder: Path) -> int:
+    return sum(is_file(find_image(folder / frame.name)) for frame in source.train)
+
+
+def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return the model with a pose of its own for each image: images of a rig cannot be left out or turned alone."""
+    if all(rig.num_sensors() == 1 for rig in model.rigs.values()):
+        return model
+    with TemporaryDirectory() as folder:
+        model.write_binary(folder)
+        for name in ("rigs.bin", "frames.bin"):
+            (Path(folder) / name).unlink()
+        return pycolmap.Reconstruction(folder)
+
+
+def _check_lenses(model: pycolmap.Reconstruction, place: Path) -> None:
+    for key, camera in model.cameras.items():
+        who = f"{place}: camera {key} ({camera.model.name})"
+        if camera.model.name == "EQUIRECTANGULAR":
+            raise SceneError(f"{who} sees all around, which no pinhole image shows; cut its photos into several first")
+        if not np.isfinite(camera.params).all():
+            raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
+
+
+def _model_of(source: SceneSource, lenses: Lenses) -> pycolmap.Reconstruction:
+    """Return frames and points of a transforms file as a model of COLMAP."""
+    model, cameras = pycolmap.Reconstruction(), dict[str, int]()
+    for number, frame in enumerate(source.train, start=1):
+        camera = frame.camera
+        kind, distortion = _colmap_lens(frame, *lenses[frame.path])
+        values = [camera.fx, camera.fy, camera.cx, camera.cy, *distortion]
+        lens = pycolmap.Camera(model=kind, width=camera.width, height=camera.height, params=values)
+        lens.camera_id = cameras.setdefault(repr((camera.size, kind, values)), len(cameras) + 1)
+        if lens.camera_id not in model.cameras:
+            model.add_camera_with_trivial_rig(lens)
+        image = pycolmap.Image(name=frame.name, camera_id=lens.camera_id, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera.numpy()[:3]))
+    for point, color in zip(source.points, source.colors.clip(0.0, 1.0) * 255.0, strict=True):
+        model.add_point3D(point, pycolmap.Track(), np.rint(color).astype(np.uint8))
+    return model
+
+
+def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> tuple[str, list[float]]:
+    """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
+    if kind in PINHOLE_MODELS and not distortion:
+        return "PINHOLE", []
+    model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
+    values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
+    if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):
+        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
+        raise SceneError(
+            f"{frame.path}: its camera in the transforms file ({kind}{terms}) cannot be undistorted; expected numbers "
+            f"{', '.join(OPENCV_TERMS)}, or {', '.join(FISHEYE_TERMS)} of {FISHEYE}"
+        )
+    return model, values if kind == FISHEYE else [*values, 0.0, 0.0, 0.0]
