@@ -173,5 +173,6 @@ def _turned(quaternions: Tensor, vectors: Tensor, *, back: bool = False) -> Tens
     """Rotate vectors (n, 3) by quaternions (n, 4), w first and of any length, or back; matrices would take three times
     the memory."""
     real, axis = quaternions[:, :1], quaternions[:, 1:]
-    across = torch.linalg.cross(axis, vectors) * (2.0 / quaternions.square().sum(1, keepdim=True))
-    return vectors + (-real if back else real) * across + torch.linalg.cross(axis, across)
+    across: Tensor = torch.linalg.cross(axis, vectors) * (2.0 / quaternions.square().sum(1, keepdim=True))
+    turned: Tensor = vectors + (-real if back else real) * across + torch.linalg.cross(axis, across)
+    return turned
