@@ -355,7 +355,7 @@ class BackboneAdapter:
             return GaussianField(
                 means=gaussians._xyz.detach().clone(),
                 quaternions=gaussians._rotation.detach().clone(),
-                log_scales=_three_axes(gaussians._scaling.detach().clone()),
+                log_scales=_three_axes(gaussians),
                 opacity_logits=logits.detach().clone().squeeze(-1),
                 sh=torch.cat([gaussians._features_dc, gaussians._features_rest], dim=1),
                 signed=signed,
@@ -373,8 +373,8 @@ class BackboneAdapter:
 
         for name in attributes:
             value = PARAMETERS[name](field).detach().clone()
-            if name == "_scaling" and bool((value[:, FLAT_AXES:] == FLAT_SCALE).all()):
-                value = value[:, :FLAT_AXES]
+            if name == "_scaling" and len(value):
+                value = value[:, (value != FLAT_SCALE).any(0)]
             setattr(gaussians, name, torch.nn.Parameter(value.contiguous()))
         gaussians.max_radii2D = torch.zeros(len(field), device=field.means.device)
 
@@ -413,10 +413,14 @@ def _activation(gaussians: Any) -> Any:
     return getattr(gaussians, "opacity_activation", torch.sigmoid)
 
 
-def _three_axes(log_scales: Tensor) -> Tensor:
-    """Return logarithms of scales (n, 3), given those of flat Gaussians (n, 2) or of others."""
-    if log_scales.shape[1] != FLAT_AXES:
-        return log_scales
+def _three_axes(gaussians: Any) -> Tensor:
+    """Return logarithms of a model's scales (n, 3): flat Gaussians get one for the axis that the model has without."""
     import torch
 
+    log_scales: Tensor = gaussians._scaling.detach().clone()
+    if log_scales.shape[1] != FLAT_AXES:
+        return log_scales
+    scales: Tensor = gaussians.get_scaling.detach()
+    if scales.shape[1] != FLAT_AXES:
+        return scales.log().clamp_min(FLAT_SCALE)
     return torch.nn.functional.pad(log_scales, (0, 1), value=FLAT_SCALE)

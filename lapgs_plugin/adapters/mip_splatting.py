@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter, logits_of
 from lapgs_plugin.adapters.info import BackboneInfo
+from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.checkouts.training_call import TrainingCall
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 
 FILTER = "filter_3D"
 """Attribute of its model, (n, 1) standard deviations, and property of its PLY files."""
+
+FILTERED = {FILTER, "get_scaling_with_3D_filter", "get_opacity_with_3D_filter"}
+"""Attributes by which its forks are recognised."""
 
 
 class Adapter(BackboneAdapter):
@@ -28,6 +32,16 @@ class Adapter(BackboneAdapter):
         fork_of=("graphdeco",),
         raster_defaults={"kernel_size": 0.1},
     )
+
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        """Return whether a folder is a checkout, or a fork that kept its filters and not its files."""
+        if super().recognises(folder):
+            return True
+        source, settings = readable_source(folder), cls.info.raster_defaults.keys()
+        if source is None or not any(use.settings >= settings for use in source.rasterizers):
+            return False
+        return source.attributes >= FILTERED
 
     @classmethod
     def saved_field(cls, path: Path) -> GaussianField:

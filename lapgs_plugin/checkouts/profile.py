@@ -6,6 +6,7 @@ They are found by what they do, and replaced wherever the checkout holds them, b
 from __future__ import annotations
 
 import ast
+import dis
 import importlib
 import inspect
 import sys
@@ -81,7 +82,7 @@ class Profile:
         self.model = self._find_model()
         self.scene = self._find_scene()
         makers = [(each, vars(each).get("__init__")) for each in self._classes()]
-        self.cameras = tuple(each for each, make in makers if _names(make) >= CAMERA_ROLES)
+        self.cameras = tuple(each for each, make in makers if _attributes_set(make) >= CAMERA_ROLES)
         self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
         self.renderers = tuple(self._find_renderers())
         self.density_control = tuple(sorted(_changing(self.model)))
@@ -338,6 +339,13 @@ def _names(function: Any) -> set[str]:
     """Return the names of attributes and globals that a function uses, none for anything else."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     return set() if code is None else set(code.co_names)
+
+
+def _attributes_set(function: Any) -> set[str]:
+    """Return the names of attributes that a function sets, none for anything else."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    found = () if code is None else dis.get_instructions(code)
+    return {each.argval for each in found if each.opname == "STORE_ATTR"}
 
 
 def _records_no_gradients(node: ast.AST) -> bool:

@@ -235,6 +235,20 @@ class Schedule:
                 end = last - 1 if last and end - last < total / RARE**2 else end
         return end
 
+    def begun(self, variables: Mapping[str, Any], total: int) -> StageSchedule:
+        """Return what changes so that whatever begins later in a run, such as a loss, is on from its first iteration.
+
+        Args:
+            variables: those that the function sees, by name.
+            total: iterations of the run.
+        """
+        changed = StageSchedule(self._function, self._variable)
+        for operand in (operand for event in self.events for operand in event.operands):
+            number = operand.number(variables) if operand.operator in (ast.Gt, ast.GtE) and operand.is_bound else None
+            if number is not None and 0 < number < total:
+                changed.set(operand, number, 0)
+        return changed
+
     def for_stage(
         self, whole: Mapping[str, Any], stage: Mapping[str, Any], window: StageWindow, keep: Collection[str] = ()
     ) -> StageSchedule:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -111,7 +111,7 @@ class CheckoutSource:
         near = ""
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
             modules = dict(_reachable(script, (script.parent, root)))
-            found, close = _find_model(modules, root)
+            found, close = _find_model(modules, root, _called(tree))
             near = near or close
             if found is not None:
                 break
@@ -172,8 +172,14 @@ class CheckoutSource:
         classes = {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
         if not _methods(classes[self.model[0]], classes)[1]:
             return []
-        known = {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        known = self.attributes
         return [name for name in names if name not in known]
+
+    @property
+    def attributes(self) -> set[str]:
+        """Names of attributes that its modules set or read."""
+        nodes = (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path)))
+        return {node.attr for node in nodes if isinstance(node, ast.Attribute)}
 
     def unpacks(self, function: str) -> bool:
         """Return whether the checkout unpacks what a function of that name returns, or takes one of its results."""
@@ -267,8 +273,11 @@ def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
     return None
 
 
-def _find_model(modules: Mapping[str, Path], root: Path) -> tuple[tuple[str, str] | None, str]:
-    """Return the name and place of the Gaussians' class, and the place of one that only resembles it."""
+def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]) -> tuple[tuple[str, str] | None, str]:
+    """Return the name and place of the Gaussians' class, and the place of one that only resembles it.
+
+    Of several classes it is one that the script calls, `called`: others may be its bases.
+    """
     near = ""
     classes = {
         node.name: (node, path)
@@ -276,8 +285,9 @@ def _find_model(modules: Mapping[str, Path], root: Path) -> tuple[tuple[str, str
         for node in parsed_quietly(path).body
         if isinstance(node, ast.ClassDef)
     }
-    for name, (node, path) in classes.items():
-        methods, whole = _methods(node, {key: value[0] for key, value in classes.items()})
+    nodes = {name: node for name, (node, _) in classes.items()}
+    for name, (node, path) in sorted(classes.items(), key=lambda each: each[0] not in called):
+        methods, whole = _methods(node, nodes)
         if "training_setup" not in methods:
             continue
         where = place(path, root, node.lineno)

@@ -102,6 +102,11 @@ class TrainingCall:
         return next((iterations for name, iterations in lists if name.startswith("test")), ())
 
     @property
+    def variables(self) -> dict[str, Any]:
+        """What the function sees by name: globals and arguments."""
+        return {**inspect.unwrap(self.function).__globals__, **self.values}
+
+    @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
 

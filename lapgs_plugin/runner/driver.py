@@ -12,7 +12,6 @@ are one field: a single call trains them (`single_call`). Everything between ren
 
 from __future__ import annotations
 
-import inspect
 import logging
 import os
 import shlex
@@ -142,7 +141,7 @@ class HierarchyDriver:
                 self._options.kind,
             )
             if not self._has_residuals:
-                plan = between_events(plan, self._schedule, _variables(call))
+                plan = between_events(plan, self._schedule, call.variables)
             dry_run = DryRun(self._context, call, scene, plan)
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
@@ -193,13 +192,13 @@ class HierarchyDriver:
         """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""
         level = window.stage.level
         call = self._adapter.stage_call(run.call, window, str(run.archive.path(f"level_{level}")))
-        changed = self._schedule.for_stage(_variables(run.call), call.values, window, self._adapter.info.unscaled)
+        changed = self._schedule.for_stage(run.call.variables, call.values, window, self._adapter.info.unscaled)
         if changed.notes:
             logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
         return replace(call, values=changed.arguments(call.values), function=changed.function(call.function))
 
     def _log_schedule(self, call: TrainingCall) -> None:
-        lines = self._schedule.describe(_variables(call))
+        lines = self._schedule.describe(call.variables)
         logger.info("%s acts by iteration: %s", self._adapter.script.path.name, "; ".join(lines) or "nowhere")
 
     @cached_property
@@ -250,11 +249,6 @@ def between_events(plan: StagePlan, schedule: Schedule, variables: Mapping[str, 
             stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
         before += stages[i].iterations
     return replace(plan, stages=tuple(stages))
-
-
-def _variables(call: TrainingCall) -> dict[str, Any]:
-    """Return what a call's function sees by name: globals and arguments."""
-    return {**inspect.unwrap(call.function).__globals__, **call.values}
 
 
 def _now_in_files() -> int:

@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.level_views import shrunk
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -87,8 +89,14 @@ class DryRun:
                 rendering.accumulated = _Nothing(sizes, self._context.device)
                 rendering.composed = frozenset(self._cameras)
             call = self._scratch_call(folder)
-            stage = _DryStage(call, rendering, self._stage, lambda gaussians: self._scene_for(call, gaussians))
+
+            def stage_of(call: TrainingCall) -> _DryStage:
+                return _DryStage(call, rendering, self._stage, lambda gaussians: self._scene_for(call, gaussians))
+
+            stage = stage_of(call)
             self._iterate(stage, works)
+            if self._stage.signed:
+                self._iterate_later(stage_of, call)
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
             with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
@@ -125,6 +133,34 @@ class DryRun:
 
     def _iterate(self, stage: _DryStage, works: str) -> None:
         """Run the first iteration of the script's loop."""
+        with self._running(stage), self._step("the first iteration", "one as without lapgs", works):
+            stage.call.run()
+        if stage.iteration == 0:
+            raise UserInputError(
+                f"{self._training_place}: {stage.call.function.__name__}() began no iteration, expected one call of "
+                f"{CLOCK}, or one step of the positions, an iteration; {OFF}"
+            )
+
+    def _iterate_later(self, stage_of: Callable[[TrainingCall], _DryStage], call: TrainingCall) -> None:
+        """Run an iteration with all losses that begin later in a run, of which some cannot be a residual's.
+
+        The base would be trained before that is found out. What else fails does so because nothing led up to it.
+        """
+        later = Schedule(self._adapter.profile.source.training).begun(self._call.variables, self._plan.iterations)
+        if not later.notes:
+            return
+        call = replace(call, values=later.arguments(call.values), function=later.function(call.function))
+        try:
+            with self._running(stage_of(call)):
+                call.run()
+        except LapgsError:
+            raise
+        except Exception as error:
+            logger.debug("dry run of what begins later (%s): %s", ", ".join(later.notes), typed_line(error))
+
+    @contextmanager
+    def _running(self, stage: _DryStage) -> Iterator[None]:
+        """Let a stage answer the replaced symbols, and leave the loop after its first iteration."""
 
         def stepped(optimizer: Optimizer, *_: Any) -> None:
             if stage.iteration == 0 and steps_positions(optimizer, stage.gaussians):
@@ -134,19 +170,13 @@ class DryRun:
         self._context.stage = stage
         watching = register_optimizer_step_post_hook(stepped)
         try:
-            with self._step("the first iteration", "one as without lapgs", works):
-                stage.call.run()
+            yield
         except _Enough:
             pass
         finally:
             watching.remove()
             self._context.wrapper.rendering = None
             self._context.stage = None
-        if stage.iteration == 0:
-            raise UserInputError(
-                f"{self._training_place}: {stage.call.function.__name__}() began no iteration, expected one call of "
-                f"{CLOCK}, or one step of the positions, an iteration; {OFF}"
-            )
 
     def _scratch_call(self, folder: Path) -> TrainingCall:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""

@@ -80,6 +80,32 @@ def test_two_rasterizers_of_one_name_are_each_replaced_once(
     assert places == {MODULE: ["gaussian_renderer"], OTHER: [OTHER]}
 
 
+def test_a_scene_that_reads_its_cameras_is_no_camera(scene: Path, tmp_path: Path) -> None:
+    """As PGSR's, which compares their poses to find the nearest ones of each."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    path, line = checkouts / "graphdeco" / "scene" / "__init__.py", "        self.gaussians = gaussians\n"
+    text, reads = path.read_text(encoding="utf-8"), "gaussians.image_name, gaussians.world_view_transform"
+    assert text.count(line) == 1
+    path.write_text(
+        text.replace(line, f"{line}        if not args:\n            self.pose = {reads}\n"), encoding="utf-8"
+    )
+    with loaded(STUBS["graphdeco"], scene, tmp_path, script=checkouts / "graphdeco" / "train.py") as adapter:
+        assert adapter.profile.scene.__name__ == "Scene"
+        assert [each.__name__ for each in adapter.profile.cameras] == ["Camera"]
+
+
+def test_the_model_is_the_class_that_the_script_calls(tmp_path: Path) -> None:
+    """As of TrimGS, whose script makes a class derived from 3DGS's, which it imports, too."""
+    root = Path(shutil.copytree(CHECKOUTS / "graphdeco", tmp_path / "fork", ignore=shutil.ignore_patterns("__pyc*")))
+    with (root / "scene" / "gaussian_model.py").open("a", encoding="utf-8") as model:
+        model.write("\n\nclass Flat(GaussianModel):\n    pass\n")
+    script = root / "train.py"
+    text = script.read_text(encoding="utf-8")
+    assert CheckoutSource.read(script).model[0] == "GaussianModel"
+    script.write_text(text.replace(" = GaussianModel(", " = Flat(") + "\n", encoding="utf-8")
+    assert CheckoutSource.read(script).model[0] == "Flat"
+
+
 def test_a_rasterizer_that_is_not_installed_is_the_checkouts_own(fork: Path) -> None:
     error = ModuleNotFoundError(f"No module named '{OTHER}'", name=OTHER)
     script = fork / "scripts" / "train.py"

@@ -205,6 +205,34 @@ def test_what_a_renderer_does_in_training_alone_is_left_out_of_predictions_and_m
     assert not [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
 
 
+LATER = {
+    "a loss of depths": "        if iteration > 8:\n            loss = loss + render_pkg['depth'].mean()\n",
+    "what an earlier iteration made": (
+        "        if iteration == 6:\n            gaussians.made = 0.0\n"
+        "        if iteration > 8:\n            loss = loss + gaussians.made\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("later", LATER)
+def test_what_begins_later_is_tried_before_the_base_is_trained(later: str, scene: Path, tmp_path: Path) -> None:
+    """As of forks that regularise normals from the middle of a run on."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text, line = script.read_text(encoding="utf-8"), "        Ll1depth = 0\n"
+    assert text.count(line) == 1
+    script.write_text(text.replace(line, line + LATER[later]), encoding="utf-8")
+    message = r"train.py:\d+: the loop trains on an image of other colours .* --hierarchy nested"
+    trains = later != "a loss of depths"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        nullcontext() if trains else pytest.raises(UserInputError, match=message),
+    ):
+        drive(adapter, dry_run=True, hierarchy="laplacian")
+    assert (tmp_path / "run").exists() == trains
+
+
 def test_depths_that_are_rasterized_before_the_image_change_no_iteration(scene: Path, tmp_path: Path) -> None:
     """Before a stage trains it is known which of the renderer's colours are the model's."""
     checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))

@@ -53,6 +53,26 @@ def test_a_field_comes_out_as_it_went_in(name: str, degree: int, scene: Path, tm
         assert getattr(out, part).data_ptr() != getattr(field, part).data_ptr(), "no shared memory"
 
 
+@pytest.mark.parametrize("thin", [0, 1, 2, None])
+def test_flat_gaussians_are_flat_along_the_models_axis(
+    thin: int | None, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their models have two scales: 2DGS renders these, TrimGS puts a thin one before them."""
+    field = some_field()
+    with loaded(STUBS["graphdeco"], scene, tmp_path) as adapter:
+        model, axis = model_of(adapter), 2 if thin is None else thin
+        adapter.import_field(model, field)
+        model._scaling = torch.nn.Parameter(field.log_scales[:, :2].clone())
+        scales = model._scaling.exp()
+        three = torch.cat([scales[:, :axis], torch.full((50, 1), 1e-8), scales[:, axis:]], 1)
+        monkeypatch.setattr(type(model), "get_scaling", property(lambda _: scales if thin is None else three))
+        out = adapter.export_field(model, signed=False)
+        torch.testing.assert_close(out.log_scales.exp(), three.detach(), atol=1e-6, rtol=1e-6)
+        again = model_of(adapter)
+        adapter.import_field(again, out)
+        torch.testing.assert_close(again._scaling, model._scaling)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_checkouts_ply_is_the_exported_field(name: str, scene: Path, tmp_path: Path) -> None:
     """We read the checkout's files, and it exports the same field that we write."""

@@ -68,6 +68,17 @@ def test_a_fork_that_kept_a_file_is_recognised_by_what_it_renders_with(
     assert adapter_class(checkout).info.name == name
 
 
+def test_a_fork_that_kept_filters_is_recognised_without_the_files_of_its_source(tmp_path: Path) -> None:
+    """As a fork of Mip-Splatting that extracts meshes: its fields need the filters of its model applied."""
+    checkout = changed(tmp_path, (BLUR, f"{BLUR}        kernel_size=0.1,\n"))
+    assert adapter_class(checkout).info.name == "generic"
+    filters = "pc.filter_3D, pc.get_scaling_with_3D_filter, pc.get_opacity_with_3D_filter"
+    (checkout / "filters.py").write_text(f"def filtered(pc):\n    return {filters}\n")
+    with (checkout / "gaussian_renderer" / "__init__.py").open("a", encoding="utf-8") as renderer:
+        renderer.write("\nimport filters\n")
+    assert adapter_class(checkout).info.name == "mip_splatting"
+
+
 def test_a_rasterizer_that_returns_more_than_any_stand_in(tmp_path: Path) -> None:
     """As those that return depth and alpha, too, and are otherwise called as graphdeco's."""
     checkout = changed(tmp_path, ("rendered_image, radii = ", "rendered_image, radii, depth, alpha = "))

@@ -334,6 +334,27 @@ def test_a_render_of_another_size_is_said() -> None:
 def test_outputs_without_an_image_are_named() -> None:
     camera, images = made()
     wrapper, settings, _ = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
-    broken = wrapper._function(lambda rasterizer_settings: (torch.zeros(7, 3, 4), torch.zeros(2)))
-    with pytest.raises(UserInputError, match=r"returns \(7, 3, 4\), \(2,\), expected an image \(3, h, w\) of 4x3"):
+    broken = wrapper._function(lambda rasterizer_settings: (torch.zeros(2, 3, 4), torch.zeros(2)))
+    with pytest.raises(UserInputError, match=r"returns \(2, 3, 4\), \(2,\), expected an image \(3, h, w\) of 4x3"):
         broken(rasterizer_settings=settings(3, 4, torch.ones(3), torch.eye(4)))
+
+
+@pytest.mark.parametrize("leading", [(), (1,)])
+def test_an_image_is_the_first_three_of_more_channels(leading: tuple[int, ...]) -> None:
+    """As of a rasterizer that returns normals, depth and opacity in one tensor with the colours."""
+    camera, images = made()
+    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+
+    def forward(means: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
+        rows = torch.arange(5.0).reshape(*leading, 5, 1, 1) + means.mean()
+        return rows.expand(*leading, 5, 3, 4), torch.zeros(2)
+
+    means, function = torch.zeros(2, 3, requires_grad=True), wrapper._function(forward)
+    render = wrapper.renderer(lambda view: function(means, settings(3, 4, torch.ones(3), torch.eye(4)))[0])
+    found = render(camera)
+    assert found.shape == (*leading, 5, 3, 4)
+    assert found.amax((-1, -2)).flatten().tolist() == [0.25, 1.25, 2.25, 3, 4], "Up(coarse) is added to colours alone"
+    found[..., :3, :, :].sum().backward(retain_graph=True)
+    (found[..., 3, :, :] * 0).sum().backward(retain_graph=True)  # a loss that has no weight yet
+    with pytest.raises(UserInputError, match="other colours than the model's"):
+        found[..., 3, :, :].sum().backward()

@@ -121,6 +121,36 @@ def test_late_events_keep_their_share_and_all_else_its_count() -> None:
     assert {"3000 -> 1500", "15500 -> 7750", "opt.prune_interval -> 1500", "GLOBAL.late -> 10000"} <= set(notes)
 
 
+def test_what_begins_later_is_on_from_the_first_iteration() -> None:
+    """Not what begins after the run's end, and nothing happens that does so at a period or at one iteration."""
+    source = """
+def training(opt, seen):
+    kick_on = 100
+    for iteration in range(1, opt.iterations + 1):
+        weight = opt.weight if iteration >= opt.normals_from else 0
+        if 700 < iteration:
+            seen.geometry(iteration)
+        if iteration > kick_on and iteration < opt.until:
+            seen.depths(iteration)
+        if iteration > opt.never:
+            seen.never(iteration)
+        if iteration > 500 and iteration % 100 == 0 or iteration == 600:
+            seen.densify(iteration)
+        seen.weights(weight)
+"""
+    tree, namespace = ast.parse(source), dict[str, Any]()
+    exec(compile(tree, "train.py", "exec"), namespace)
+    opt = SimpleNamespace(iterations=1000, weight=5, normals_from=400, until=300, never=1001)
+    definition, seen = tree.body[0], Seen()
+    assert isinstance(definition, ast.FunctionDef)
+    later = Schedule(definition).begun({"opt": opt}, 1000)
+    values = later.arguments({"opt": opt, "seen": seen})
+    values["opt"].iterations = 1
+    later.function(namespace["training"])(**values)
+    assert seen.at == {"geometry": [1], "depths": [1], "weights": [5]}
+    assert opt.normals_from == 400, "the script's own options stay"
+
+
 def test_a_rare_harmful_event_leaves_the_last_tenth_of_a_stage_alone() -> None:
     """A period of 5000 would simplify in the last iteration of a stage of 15,000, not in the last tenth of 16,800."""
     moved, notes = trained(15_000)
