@@ -178,6 +178,24 @@ def test_a_short_run_grows_in_larger_steps() -> None:
     assert len(model) == 150
 
 
+@pytest.mark.parametrize("views", [1, 3, 8, 16])
+def test_noise_of_steps_of_few_views_comes_at_once(monkeypatch: pytest.MonkeyPatch, views: int) -> None:
+    """Its variance is that of noise after each step, whatever the number of views of a step."""
+    amounts: dict[int, float] = {}
+    model, camera, iteration = trained_once(30), ring_scene().train[0].camera, 0
+    monkeypatch.setattr(mcmc, "shake", lambda model, amount: amounts.__setitem__(iteration, amount))
+    control = McmcDensifier(schedule_of(10_000), replace(Mcmc(), cap_max=30))
+    steps = []
+    for iteration in range(views, 97, views):
+        steps.append(1e-4 / iteration)
+        model.optimizers["means"].param_groups[0]["lr"] = steps[-1]
+        control.after_step(model, iteration, None, camera)
+    together = max(views, math.ceil(8 / views) * views)
+    assert list(amounts) == list(range(together, 97, together))
+    variance = sum(amount**2 for amount in amounts.values())
+    assert variance == pytest.approx(mcmc.NOISE**2 * sum(step**2 for step in steps[: max(amounts) // views]))
+
+
 def test_nothing_is_due_for_resets_that_never_come() -> None:
     schedule = schedule_of(9000)  # 3DGS's heuristics reset every 900 iterations
     assert schedule.sampled(5) == {1800, 3600, 5400, 7200, 9000}
