@@ -343,5 +343,6 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
                 continue
             where = place(path, root, node.lineno)
             for each, names in imports.items():
-                if each not in modules and each.partition(".")[0] not in modules:
+                own = each.partition(".")[0] in modules or any(name.startswith(f"{each}.") for name in modules)
+                if each not in modules and not own:
                     yield External(each, names, where, id(node) not in needed)
