@@ -9,6 +9,9 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.spherical_harmonics import sh_to_color
+from lapgs_plugin.runner.object_values import fields_of
+from lapgs_plugin.runner.signed_calls import DEGREES
 from lapgs_plugin.runner.stage_rendering import Captured
 
 SAME_VALUE = 1e-3
@@ -58,6 +61,20 @@ def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
             given.append(given[0].clamp(max=1))  # as those above 1 are archived, of which a warning tells
         if not any(_alike(each, value) for each in given for value in values):
             yield what
+    if _has_other_colors(captured, field):
+        yield "colours"
+
+
+def _has_other_colors(captured: Captured, field: GaussianField) -> bool:
+    """Return whether the renderer evaluates colours that are not those of the field's SH, as by a network."""
+    given, settings = captured.inputs.get("colors_precomp"), fields_of(captured.settings)
+    degree = next((settings[name] for name in DEGREES if name in settings), None)
+    if not isinstance(given, Tensor) or given.shape != field.means.shape or degree is None or "campos" not in settings:
+        return False
+    field, degree = field.to(given.device), min(int(degree), field.sh_degree)
+    directions = torch.nn.functional.normalize(field.means - settings["campos"], dim=-1)  # (n, 3)
+    expected = (sh_to_color(field.sh, directions, degree, signed=signed) for signed in (False, True))
+    return not any(torch.allclose(given.detach(), each, rtol=SAME_VALUE, atol=SAME_VALUE) for each in expected)
 
 
 def _alike(given: object, value: Tensor) -> bool:

@@ -80,13 +80,13 @@ def _image_place(outputs: Any, size: tuple[int, ...]) -> Any:
     if isinstance(outputs, Tensor):
         return None
     found = {p: tuple(v.shape) for p, v in _items(outputs) if isinstance(v, Tensor) and v.is_floating_point()}
-    for place, shape in found.items():
-        if 3 <= len(shape) <= 4 and all(one == 1 for one in shape[:-3]):
-            first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
-            if first or last or (not size and 3 in (shape[-3], shape[-1])):
-                return place
-    for place, shape in found.items():
-        if size and shape[-2:] == size and len(shape) == 3 and shape[0] > 3:
+    maps = {p: s for p, s in found.items() if 3 <= len(s) <= 4 and all(one == 1 for one in s[:-3])}
+    for place, shape in maps.items():
+        first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
+        if first or last or (not size and 3 in (shape[-3], shape[-1])):
+            return place
+    for place, shape in maps.items():
+        if shape[-3] > 3 and shape[-2:] == size:
             return place
     shapes = ", ".join(map(str, found.values())) or "no tensor"
     raise UserInputError(

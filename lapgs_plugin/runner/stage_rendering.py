@@ -44,16 +44,16 @@ class Captured:
     Attributes:
         rasterizer: with its settings.
         inputs: by name.
-        size: (h, w) of the view.
+        settings: of the rasterizer.
     """
 
     rasterizer: Callable[..., Any]
     inputs: Mapping[str, Any]
-    size: tuple[int, ...]
+    settings: Any
 
     def image(self, **others: Any) -> Tensor:
         """Return the image (3, h, w) with other values of some inputs, not composed."""
-        return RasterOutputs.of(self.rasterizer(**{**self.inputs, **others}), self.size).image
+        return RasterOutputs.of(self.rasterizer(**{**self.inputs, **others}), size_of(self.settings)).image
 
 
 @dataclass
@@ -201,7 +201,7 @@ class StageRendering:
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
         image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
-            self.captured, self.call = image, Captured(rasterizer, inputs, size_of(settings))
+            self.captured, self.call = image, Captured(rasterizer, inputs, settings)
         for each in outputs.maps_beside if self.signed else ():
             each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)
