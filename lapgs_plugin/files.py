@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import socket
 import sys
 import time
@@ -28,6 +29,15 @@ LOCK, LOCK_POLL_SECONDS = ".lock", 0.05
 
 TEMPORARY_PATTERN = ".*.tmp"
 """Glob of the temporary files of `atomic_write`, which a killed process may leave."""
+
+
+def as_pip_argument(folder: Path) -> str:
+    """Return a folder as `pip install` takes it in a shell: a name without a slash would be a package to download.
+
+    >>> as_pip_argument(Path("rasterizer")), as_pip_argument(Path("/code/my rasterizer"))
+    ('./rasterizer', "'/code/my rasterizer'")
+    """
+    return shlex.quote(os.path.join(".", folder))  # noqa: PTH118
 
 
 @contextmanager

@@ -25,7 +25,7 @@ class Option:
     Attributes:
         help: text of one or two sentences.
         panel: title of its group in `--help`.
-        names: of the option, the current one first, then old ones; empty for a name made from the field's.
+        names: of the option, the longest first; empty for a name made from the field's.
         least, most: bounds of a number.
         choices: accepted texts; empty for any.
         metavar: name of its value in `--help`; empty for its type.

@@ -50,7 +50,8 @@ def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[No
         needs_logs = variant is not None and VARIANTS[variant].needs_logs
         stack.enter_context(_replaced(sys.modules, absent_modules(needs_logs)))
         stack.enter_context(_replaced(vars(torch.cuda), _WITHOUT_CUDA))
-        stack.enter_context(_replaced(vars(torch), {"load": _loading_to_cpu(torch.load)}))
+        on_cpu = {"load": _loading_to_cpu(torch.load), "Generator": _Generator}
+        stack.enter_context(_replaced(vars(torch), on_cpu))
         mode = _CudaMeansCpu()
         stack.enter_context(_replaced(vars(torch.autograd), _engine_within(mode)))
         stack.enter_context(_threads_within(mode))
@@ -143,6 +144,13 @@ def _loading_to_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
         return load(file, _CPU if map_location is None else _redirected(map_location), *args, **kwargs)
 
     return loading
+
+
+class _Generator(torch.Generator):
+    """Stand in for `torch.Generator`, a class, which `_CudaMeansCpu` does not see."""
+
+    def __new__(cls, device: Any = "cpu") -> _Generator:
+        return super().__new__(cls, _redirected(device))  # type: ignore[call-arg]  # as the class takes it
 
 
 class _Event:

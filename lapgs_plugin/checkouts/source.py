@@ -14,6 +14,7 @@ from pathlib import Path
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import executed_on_import, parsed, parsed_quietly, place
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import as_pip_argument
 
 MODEL_ROLES = ("get_xyz", "training_setup")
 """Methods by which the class of the Gaussians is recognised."""
@@ -63,7 +64,7 @@ class OwnPackage:
     def install(self) -> str:
         """The command that installs it."""
         # A build of its own would not find the PyTorch that it is compiled for.
-        return f"pip install {'--no-build-isolation ' * self.needs_cuda}{self.folder}"
+        return f"pip install {'--no-build-isolation ' * self.needs_cuda}{as_pip_argument(self.folder)}"
 
 
 @dataclass(frozen=True)
@@ -343,5 +344,6 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
                 continue
             where = place(path, root, node.lineno)
             for each, names in imports.items():
-                if each not in modules and each.partition(".")[0] not in modules:
+                own = each.partition(".")[0] in modules or any(name.startswith(f"{each}.") for name in modules)
+                if each not in modules and not own:
                     yield External(each, names, where, id(node) not in needed)

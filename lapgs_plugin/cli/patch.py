@@ -141,7 +141,7 @@ def _write(verb: str, planned: Sequence[tuple[Target, FileChange]], allow_dirty:
     write_all(changes)
     for change in changes:
         typer.echo(f"{verb} {change.path}")
-    commands = [target.recipe.reinstall.format(folder=target.folder) for target, _ in planned]
+    commands = [target.reinstall for target, _ in planned]
     typer.echo("Next, reinstall the changed extensions:")
     for command in dict.fromkeys(commands):
         typer.echo(f"  {command}")

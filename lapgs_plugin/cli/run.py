@@ -113,6 +113,7 @@ def run(
         return
     logging.basicConfig(format="lapgs: %(message)s")
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
+    logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.WARNING)  # of the preview
     attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
     attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
     _execute(path, words, kind, root, device, options, settings, measuring, watcher)

@@ -18,7 +18,7 @@ from packaging.version import Version
 
 from lapgs_plugin.environment import PACKAGE, gsplat_built, installed_version, processor_name, run_program
 from lapgs_plugin.environment.probes import Probe, run_probe
-from lapgs_plugin.errors import typed_line
+from lapgs_plugin.errors import counted, typed_line
 from lapgs_plugin.limits import usable_processors
 
 NOT_REPORTED = ("", "dev")
@@ -125,7 +125,7 @@ def numba_findings(probe: Probe) -> list[Finding]:
     if probe.error:
         return [Finding("CPU rasterizer", "problem", probe.error, "python -m pip install --force-reinstall numba")]
     facts = probe.facts
-    found = [Finding("CPU rasterizer", "ok", f"Numba {facts['numba']}, {facts['threads']} threads")]
+    found = [Finding("CPU rasterizer", "ok", f"Numba {facts['numba']}, {counted(facts['threads'], 'thread')}")]
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         found = [Finding("CPU rasterizer", "problem", "NUMBA_DISABLE_JIT is set", "unset NUMBA_DISABLE_JIT")]
     if facts["cache"] is None:

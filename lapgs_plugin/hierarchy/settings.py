@@ -150,7 +150,6 @@ class HierarchySettings:
         "Where training images and cached predictions of coarser levels are kept: gpu, memory or disk. auto: by their "
         "size.",
         panel=STORAGE,
-        names=("--images-on", "--cache"),
         choices=(AUTO, *PLACES),
     )
     prediction_precision: str = option(
@@ -158,7 +157,6 @@ class HierarchySettings:
         "Precision of cached predictions of coarser levels: float32, float16 or uint8. auto: float16 on a GPU, float32 "
         "on a CPU.",
         panel=STORAGE,
-        names=("--prediction-precision", "--cache-precision"),
         choices=(AUTO, *PRECISIONS),
     )
     seed: int = option(0, "Seed of all random choices of lapgs.", panel="Run")

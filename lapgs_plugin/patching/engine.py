@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.files import is_folder
+from lapgs_plugin.files import as_pip_argument, is_folder
 from lapgs_plugin.patching.blocks import find_blocks, insertion, replacement, stray_marker, without_blocks
 from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes, read_source
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
@@ -35,6 +35,11 @@ class Target:
         """Sources that the recipe needs by their names in it, without missing ones."""
         paths = {file: self.folder / file for file in self.recipe.files}
         return {file: path for file, path in paths.items() if path.is_file()}
+
+    @property
+    def reinstall(self) -> str:
+        """The command that builds and installs it again."""
+        return self.recipe.reinstall.format(folder=as_pip_argument(self.folder))
 
 
 @dataclass(frozen=True)

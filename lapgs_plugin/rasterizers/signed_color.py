@@ -155,13 +155,13 @@ def explain_fallback(module: str, checkout: Path) -> str:
     target = next(_sources(module, checkout), None)
     if target is None:
         return f"{slow}; `lapgs patch apply CHECKOUT` on the sources it was built from, then reinstall it"
-    reinstall = target.recipe.reinstall.format(folder=target.folder)
     state = {found.set: found.state for found in status(target)}.get(SIGNED_COLOR_SET)
     if state is State.APPLIED:
         return (
-            f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run `{reinstall}`"
+            f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run "
+            f"`{target.reinstall}`"
         )
-    return f"{slow}; run `lapgs patch apply {checkout}` and then `{reinstall}`"
+    return f"{slow}; run `lapgs patch apply {checkout}` and then `{target.reinstall}`"
 
 
 def _sources(module: str, checkout: Path) -> Iterator[Target]:

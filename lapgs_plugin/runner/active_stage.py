@@ -159,7 +159,11 @@ class ActiveStage:
             LapgsError: training left nothing to archive.
         """
         self.begin()
-        self._context.returned = self._call.run()
+        try:
+            self._context.returned = self._call.run()
+        except Exception as error:
+            self.finish_despite(error)
+            raise
         self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 
@@ -208,6 +212,16 @@ class ActiveStage:
         self._compare(gaussians, field)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
+
+    def finish_despite(self, error: Exception) -> None:
+        """Archive the field if a checkout's own error came with the last iteration or later, as of a report."""
+        if isinstance(error, LapgsError) or self.gaussians is None or self.iteration < self.stage.iterations:
+            return
+        self.finish()
+        logger.warning(
+            "%s() failed after it had trained level %d, which is in the run folder (%s)",
+            *(self._call.function.__name__, self.stage.level, typed_line(error)),
+        )
 
     def restore(self) -> StageResult:
         """Return the result of this stage from its archived field."""

@@ -31,6 +31,7 @@ from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
@@ -122,12 +123,15 @@ class HierarchyDriver:
         """Train the hierarchy in place of the script's call of `training`."""
         self._adapter.refuse(call, self._has_residuals)
         require_pruning(call, self._options.prune, self._adapter.profile.model)
-        folder = Path(call.dataset.model_path or _default_folder()).absolute()
+        given = Path(call.dataset.model_path or _default_folder())
+        folder, source = given.absolute(), Path(call.dataset.source_path)
         if not self._resume:
             RunArchive.require_room(folder, self._overwrite, self._since)
+        if not source.exists():
+            raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
-            self._context.images.read_masks(Path(call.dataset.source_path), self._options.masks)
+            self._context.images.read_masks(source, self._options.masks)
             self._adapter.first_points(len(scene.points.points))
             plan = StagePlan.create(
                 self._context.images.smallest_size(),
@@ -142,7 +146,8 @@ class HierarchyDriver:
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
-            with self._open_archive(folder, make_manifest(self._adapter, self._options, call, plan)) as archive:
+            manifest = make_manifest(self._adapter, self._options, call, plan, bool(scene.test))
+            with self._open_archive(folder, manifest) as archive:
                 self._context.watcher.run_started(archive)
                 try:
                     run = TrainingRun(call, scene, archive, path)
@@ -159,7 +164,7 @@ class HierarchyDriver:
                     # A run that is continued makes its images again.
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
-        logger.info("run folder: %s; next: `lapgs eval %s`", folder, shlex.quote(str(folder)))
+        logger.info("run folder: %s; next: `lapgs eval %s`", given, shlex.quote(str(given)))
 
     def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
         """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""

@@ -124,6 +124,7 @@ class DryRun:
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
             self._require_parameters(gaussians)
+            self._require_settable(gaussians)
             self._require_three_axes(gaussians)
             gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
             path = self._color_path(self._view(self._scene.train[0]), gaussians)
@@ -228,6 +229,16 @@ class DryRun:
             raise UserInputError(
                 f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(needed)}; the model "
                 f"has no {', '.join(absent)}; {OFF}"
+            )
+
+    def _require_settable(self, gaussians: Any) -> None:
+        """Refuse a model whose parameters are computed, which cannot start from a finished field."""
+        place = self._adapter.profile.source.model[1]
+        made = {name: getattr(type(gaussians), name, None) for name in self._adapter.archived_parameters()}
+        if computed := [name for name, by in made.items() if isinstance(by, property) and by.fset is None]:
+            raise UserInputError(
+                f"{place}: the model computes {', '.join(computed)} of other values, expected parameters, which a "
+                f"residual's are set to; {NESTED_WORKS}"
             )
 
     def _require_three_axes(self, gaussians: Any) -> None:

@@ -17,18 +17,19 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks
 
 
-def scene_reference(path: Path, dataset: Any, masks: str = "none") -> SceneReference:
+def scene_reference(path: Path, dataset: Any, masks: str = "none", holds_out: bool = False) -> SceneReference:
     """Return the scene of a run of a 3DGS code base.
 
     Args:
         path: of the scene.
         dataset: the code base's options of its model.
         masks: as of `SceneReference`.
+        holds_out: whether views are held out where the code base has no option for it.
     """
     return SceneReference(
         path=str(path.absolute()),
         resolution=f"3dgs:{dataset.resolution}",
-        eval=bool(dataset.eval),
+        eval=bool(getattr(dataset, "eval", holds_out)),
         background=(1.0, 1.0, 1.0) if getattr(dataset, "white_background", False) else (0.0, 0.0, 0.0),
         kind="colmap" if (path / "sparse").is_dir() else "transforms",
         images=getattr(dataset, "images", None) or "images",
@@ -36,11 +37,19 @@ def scene_reference(path: Path, dataset: Any, masks: str = "none") -> SceneRefer
     )
 
 
-def make_manifest(adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan) -> Manifest:
-    """Return the manifest of a run before its first stage; `call` is the script's, for the whole run."""
+def make_manifest(
+    adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan, holds_out: bool
+) -> Manifest:
+    """Return the manifest of a run before its first stage.
+
+    Args:
+        adapter, settings, plan: of the run.
+        call: the script's, for the whole run.
+        holds_out: whether its scene has held-out views.
+    """
     dataset, path = call.dataset, Path(call.dataset.source_path)
     return Manifest(
-        scene=scene_reference(path, dataset, resolve_masks(path, settings.masks)),
+        scene=scene_reference(path, dataset, resolve_masks(path, settings.masks), holds_out),
         levels=plan.levels,
         grid=settings.grid,
         supervision=settings.supervision,

@@ -98,8 +98,11 @@ class SingleCall:
             self._stage.finish()
         except torch.cuda.OutOfMemoryError as error:
             raise self._stage.out_of_memory(error) from error
-        except RuntimeError:
-            self._explain_failure(self._stage)
+        except Exception as error:
+            if isinstance(error, RuntimeError):
+                self._explain_failure(self._stage)
+            if self._stage.stage.level == 0:
+                self._stage.finish_despite(error)
             raise
         finally:
             self._context.stage = None

@@ -167,7 +167,7 @@ class TrainSettings(HierarchySettings):
         "Views whose gradients are added up for each optimizer step in the last quarter of a stage, once densification "
         "has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         panel=SCHEDULE,
-        names=("--accumulate-views", "--gather"),
+        names=("--accumulate-views",),
         least=1,
     )
     views_per_step: str = option(

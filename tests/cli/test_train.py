@@ -91,8 +91,8 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
         (("--packed", "--sparse-adam", "--rasterizer", "cpu"), "--packed, --sparse-adam with --rasterizer cpu"),
         (("--strategy", "mcmc", "--absgrad"), "--absgrad True with --strategy mcmc: an option of --strategy auto"),
         (("--strategy", "mcmc", "--error-pixels", "3"), "--error-pixels 3.0 with --strategy mcmc: an option of --str"),
-        (("--cache", "tape"), "--images-on tape: expected auto, gpu, memory or disk"),
-        (("--cache-precision", "int4"), "--prediction-precision int4: expected auto, float32, float16 or uint8"),
+        (("--images-on", "tape"), "--images-on tape: expected auto, gpu, memory or disk"),
+        (("--prediction-precision", "int4"), "--prediction-precision int4: expected auto, float32, float16 or uint8"),
         (("--views-per-step", "some"), "--views-per-step some: expected auto, or a number of views"),
         (("--views-per-step", "11"), "--views-per-step 11: the scene has 10 training views; give at most as many"),
         (("--resolution", "8k"), "expected 1k, 2k, 4k"),
@@ -138,10 +138,12 @@ def test_runs_from_before_nesting_continue_with_residuals(lapgs: Lapgs, tmp_path
     other = lapgs(*words, "--hierarchy", "nested")
     assert other.returncode == 2
     assert "--hierarchy asks for nested, but the run" in other.stderr.replace("\n", " ")
-    misplaced = lapgs(*words, "--cache", "gpu")
+    misplaced = lapgs(*words, "--images-on", "gpu")
     assert misplaced.returncode == 2
     assert "gpu: expected memory or disk" in misplaced.stderr.replace("\n", " ")
-    done = lapgs(*words, "--cache", "disk", "--cache-precision", "float16")  # another place than it was started with
+    done = lapgs(
+        *words, "--images-on", "disk", "--prediction-precision", "float16"
+    )  # another place than it was started with
     assert done.returncode == 0, done.stderr
     assert [record.signed for record in RunArchive.open(run).manifest.records] == [False, True]
 

@@ -297,6 +297,17 @@ def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[s
     assert "iteration == args.ho_iteration (modify_functions)" in text, "what the loop does by iteration"
 
 
+def test_a_package_without_an_init_file_is_the_checkouts_own(fork: Path) -> None:
+    """As `utils` of DNGaussian, which another package of the environment may be called, too."""
+    (fork / "tools").mkdir()
+    (fork / "tools" / "poses.py").write_text("")
+    with (fork / "scripts" / "train.py").open("a", encoding="utf-8") as script:
+        script.write("\nfrom tools import poses\n")
+    named = [each.name for each in CheckoutSource.read(fork / "scripts" / "train.py").externals]
+    assert "open3d" in named
+    assert "tools" not in named
+
+
 def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As 2DGS has."""
     lapgs("doctor", fork)

@@ -285,3 +285,31 @@ def test_a_model_without_the_parameters_of_a_field(hierarchy: str, scene: Path, 
         drive(adapter, dry_run=True, hierarchy=hierarchy)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_model_that_computes_its_parameters_has_no_residuals(scene: Path, tmp_path: Path) -> None:
+    """As EAGLES', which decodes them; a residual's model starts from a finished field."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    path, line = checkouts / "graphdeco" / "scene" / "gaussian_model.py", "class GaussianModel(GaussianBase):\n"
+    text = path.read_text(encoding="utf-8")
+    assert text.count(line) == 1
+    computed = """\
+    def __setattr__(self, name, value):
+        super().__setattr__("latents" if name == "_rotation" else name, value)
+
+    @property
+    def _rotation(self):
+        return self.latents
+
+"""
+    path.write_text(text.replace(line, line + computed), encoding="utf-8")
+    script = checkouts / "graphdeco" / "train.py"
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        pytest.raises(
+            UserInputError, match=r"scene/gaussian_model.py:\d+: the model computes _rotation of other v"
+        ) as e,
+    ):
+        drive(adapter, dry_run=True, hierarchy="laplacian")
+    assert "\n" not in str(e.value)

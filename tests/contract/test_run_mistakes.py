@@ -85,6 +85,12 @@ OTHER_NAMES = {
 }
 
 
+def test_a_scene_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match=r"nowhere does not exist; give the script its folder") as caught:
+        run_residuals(STUBS["graphdeco"], tmp_path / "nowhere", tmp_path / "run")
+    one_line(caught.value)
+
+
 def test_a_checkout_with_other_names_trains_to_the_same_bits(copy: Path, scene: Path, tmp_path: Path) -> None:
     plys = []
     for name in ("as it is", "other names"):
@@ -391,6 +397,8 @@ def lapgs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     """Return a function that runs `lapgs run` in this process and returns exit code and lines of stderr."""
     root = logging.getLogger()
     before = root.handlers[:], logging.getLogger("lapgs_plugin").level
+    choice = logging.getLogger("lapgs_plugin.rasterizers.choice")
+    of_choice = choice.level
 
     def run(*words: Any) -> tuple[int, list[str]]:
         monkeypatch.setattr(sys, "argv", ["lapgs", "run", *map(str, words)])
@@ -401,6 +409,7 @@ def lapgs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     yield run
     root.handlers[:] = before[0]
     logging.getLogger("lapgs_plugin").setLevel(before[1])
+    choice.setLevel(of_choice)
 
 
 def test_mistakes_are_one_line_and_exit_code_2(lapgs_run: Any, scene: Path, tmp_path: Path) -> None:
@@ -454,11 +463,15 @@ def test_defaults_go_with_the_hierarchy(
     lapgs_run: Any,
     scene: Path,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The manifest has the defaults of the hierarchy. Residuals are the default hierarchy."""
-    of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
+    monkeypatch.chdir(tmp_path)
+    of_script = arguments(STUBS["graphdeco"], scene, Path("run"), ("--iterations", 30))
     code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert code == 0
+    assert caplog.messages[-1] == "run folder: run; next: `lapgs eval run`", "as it was named; the preview says nothing"
     manifest = RunArchive.open(tmp_path / "run").manifest
     assert {name: {"inherit": manifest.inherit, **manifest.settings}[name] for name in settings} == settings
     assert [record.iterations for record in manifest.records] == iterations
@@ -469,9 +482,8 @@ def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) ->
     code, lines = lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option", "-m", tmp_path / "run")
     assert code == 2
     assert "unrecognized arguments: --no_such_option" in lines[-1], "argparse's own words"
-    code, lines = lapgs_run(
-        "--device", "cpu", STUBS["taming"].script, "-s", tmp_path / "nowhere", "-m", tmp_path / "run"
-    )
+    (tmp_path / "empty").mkdir()
+    code, lines = lapgs_run("--device", "cpu", STUBS["taming"].script, "-s", tmp_path / "empty", "-m", tmp_path / "run")
     assert code == 1
     assert lines[-1] == "AssertionError: Could not recognize scene type!", "with its traceback"
 

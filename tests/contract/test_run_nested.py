@@ -337,6 +337,27 @@ def test_a_loop_that_keeps_images_from_before_it_is_told_why_it_fails(
     assert RunArchive.open(tmp_path / "run").available_levels == (1,)
 
 
+@pytest.mark.parametrize(("hierarchy", "levels"), [("nested", (1, 0)), ("laplacian", (1,))])
+def test_what_a_script_does_last_costs_no_level(
+    hierarchy: str, levels: tuple[int, ...], scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of forks that measure or compress after the last iteration, with packages that have changed since."""
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 15) as adapter:
+        training = adapter.train.training
+
+        @wraps(training)
+        def broken(**values: Any) -> None:
+            training(**values)
+            raise AttributeError("np.cast was removed")
+
+        adapter.train.training = broken
+        with pytest.raises(AttributeError, match=r"np\.cast"):
+            drive(adapter, hierarchy=hierarchy)
+    archive, level = RunArchive.open(tmp_path / "run"), levels[-1]
+    assert (archive.available_levels, archive.manifest.complete) == (levels, hierarchy == "nested")
+    assert f"failed after it had trained level {level}, which is in the run folder (AttributeError: " in caplog.text
+
+
 @pytest.mark.parametrize(("hierarchy", "iterations"), [("nested", 20), ("laplacian", 0), ("laplacian", 8)])
 def test_a_loop_that_ends_early_says_where(
     hierarchy: str, iterations: int, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -23,6 +23,7 @@ from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
+    CHECKOUTS,
     ITERATIONS,
     KINDS,
     NAMES,
@@ -284,3 +285,23 @@ def test_a_viewer_sees_a_residual_around_grey(scene: Path, tmp_path: Path) -> No
     assert len(sent) == 30
     assert sent[0].std() > 10, "the base, as it is"
     assert (sent[10] == 127).all(), "a residual that is still empty"
+
+
+def test_a_fork_without_an_option_for_held_out_views(scene: Path, tmp_path: Path) -> None:
+    """As EAGLES, which always holds some out: the run folder says so by its scene."""
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    path = checkouts / "graphdeco" / "scene" / "__init__.py"
+    text, script = path.read_text(encoding="utf-8"), checkouts / "graphdeco" / "train.py"
+    assert "args.eval" in text
+    path.write_text(text.replace("args.eval", "True"), encoding="utf-8")
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter:
+        extract = adapter.train.ModelParams.extract
+
+        def without(group: Any, args: Any) -> Any:
+            found = extract(group, args)
+            del found.eval
+            return found
+
+        adapter.train.ModelParams.extract = without
+        drive(adapter, levels=1)
+    assert RunArchive.open(tmp_path / "run").manifest.scene.eval

@@ -180,6 +180,9 @@ def test_same_random_numbers_as_without() -> None:
         torch.manual_seed(5)
         assert torch.equal(torch.rand(4, device="cuda"), plain[0])
         assert torch.equal(torch.randperm(9, device="cuda"), plain[1])
+        generator = torch.Generator(device="cuda").manual_seed(5)
+        assert torch.equal(torch.rand(4, generator=generator, device="cuda"), plain[0])
+    assert isinstance(generator, torch.Generator)
 
 
 def state() -> dict[str, Any]:

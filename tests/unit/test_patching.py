@@ -936,6 +936,12 @@ def lapgs_patch(*arguments: str | Path) -> str:
     return result.output
 
 
+def test_a_rasterizers_folder_is_no_name_of_a_package(rasterizer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pip would look for `diff-gaussian-rasterization` in its index, and install whatever is there."""
+    monkeypatch.chdir(rasterizer.parent)
+    assert f"pip install --no-build-isolation ./{rasterizer.name}\n" in lapgs_patch("apply", rasterizer.name)
+
+
 def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     checkout = rasterizer.parents[1]
     pristine = snapshot(checkout)
