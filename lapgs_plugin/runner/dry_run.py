@@ -51,6 +51,8 @@ NATIVE_COEFFICIENTS = 15
 
 OFF = "`lapgs run --off` runs the script as it is"
 
+NESTED_MAY_WORK = "nested levels may work: --hierarchy nested"
+
 
 class DryRun:
     """Try a checkout.
@@ -81,7 +83,7 @@ class DryRun:
         Raises:
             UserInputError: the checkout cannot be trained so; the line says what failed, where, and what works.
         """
-        works = NESTED_WORKS if self._stage.signed else OFF
+        works = NESTED_MAY_WORK if self._stage.signed else OFF
         with _undisturbed(self._context.device), _silent_writer(self._adapter.train):
             sizes = {key: level_size(self._context.images[key].size, self._stage.level) for key in self._cameras}
             rendering = StageRendering(self._stage.signed, path, self._cameras)
@@ -105,7 +107,7 @@ class DryRun:
                 field = self._adapter.export_field(stage.gaussians, signed=False)
             self._compare(field)
             if self._stage.signed:
-                with self._step("a model made from a finished field", "one that renders", NESTED_WORKS):
+                with self._step("a model made from a finished field", "one that renders", NESTED_MAY_WORK):
                     self._render(view, self._adapter.model_of(stage.call, field))
             self._evaluate(view, image)
 
@@ -118,7 +120,7 @@ class DryRun:
         with (
             _undisturbed(self._context.device),
             self._step(
-                "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_WORKS
+                "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_MAY_WORK
             ),
         ):
             gaussians = self._adapter.new_model(self._call)

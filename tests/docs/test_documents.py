@@ -24,8 +24,8 @@ OF_OTHERS = {
     "--filter3d", "--grad_abs_thresh", "--highfeature_lr", "--ho_iteration", "--kernel_size", "--lambda_bce",
     "--loss_thresh", "--max_n_gaussian", "--mult",
     "--opacity_reset_interval", "--optimizer_type", "--position_lr_final", "--position_lr_max_steps",
-    "--prune_iterations", "--random_background", "--save_iterations", "--sh_lower", "--start_checkpoint",
-    "--target_primitives", "--test_iterations",
+    "--prune_iterations", "--random_background", "--S_estimator", "--save_iterations", "--sh_lower",
+    "--start_checkpoint", "--target_primitives", "--test_iterations",
     # of the authors' release
     "--iter_plan",
     # of the extension in docs/extending.md
