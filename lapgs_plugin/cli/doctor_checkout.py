@@ -61,7 +61,8 @@ def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
         except UserInputError as error:
             problems.append(error)
     if not found:
-        missing = f"{path} has no train*.py, expected the root of a 3DGS checkout, or its training script"
+        lacks = "has no train*.py" if path.exists() else "does not exist"
+        missing = f"{path} {lacks}, expected the root of a 3DGS checkout, or its training script"
         raise problems[0] if problems else UserInputError(missing)
     names = list(found)
     if len(names) > 1 and names[0] != "train.py":

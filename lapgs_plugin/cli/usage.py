@@ -53,4 +53,5 @@ def one_line_usage_errors(context: Any = None) -> Iterator[None]:
             raise UserInputError(
                 f"{usage_message(error)}; expected one run, to compare it with another: {command} RUN --baseline OTHER"
             ) from error
-        raise UserInputError(f"{usage_message(error)}; see `{command} --help`") from error
+        said = usage_message(error)
+        raise UserInputError(f"{said}{' See' if said.endswith('?') else '; see'} `{command} --help`") from error

@@ -239,17 +239,20 @@ class LpipsRequest:
         """Parse the command line's value: variants separated by commas, or "none".
 
         Raises:
-            UserInputError: a variant is not known.
+            UserInputError: a variant is not known, or a file does not exist.
         """
+        files = tuple(files)
+        if absent := [file for file in files if not file.is_file()]:
+            raise UserInputError(f"--lpips-weights {absent[0]}: no such file; expected the weights of an LPIPS network")
         if variants is None:
-            return cls(None, tuple(files))
+            return cls(None, files)
         words = () if variants.strip() == "none" else tuple(dict.fromkeys(word.strip() for word in variants.split(",")))
         for word in words:
             if word not in VARIANTS:
                 raise UserInputError(
                     f"--lpips {word}: expected none, or some of {', '.join(VARIANTS)} with commas between"
                 )
-        return cls(words, tuple(files))
+        return cls(words, files)
 
 
 def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.device) -> LpipsMetrics:

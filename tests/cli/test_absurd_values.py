@@ -68,6 +68,7 @@ def test_one_line_and_nothing_written(
         ("bench raster --repeats 0", "lapgs: --repeats 0: expected at least 1; see `lapgs bench raster --help`"),
         ("view run --nothing 1", "lapgs: no such option: --nothing; see `lapgs view --help`"),
         ("nothing", "lapgs: no such command 'nothing'; see `lapgs --help`"),
+        ("trian", "lapgs: no such command 'trian'. Did you mean 'train'? See `lapgs --help`"),
         ("--nothing", "lapgs: no such option: --nothing; see `lapgs --help`"),
         ("patch nothing", "lapgs: no such command 'nothing'; see `lapgs patch --help`"),
     ],

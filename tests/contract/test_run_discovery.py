@@ -276,8 +276,10 @@ def test_a_script_of_no_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().out == "here\n", "--off recognises nothing"
     with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout"):
         lapgs("doctor", tmp_path)
-    with pytest.raises(UserInputError, match=r"has no train\*.py, expected the root of a 3DGS checkout"):
-        lapgs("doctor", tmp_path / "nowhere")
+    script.unlink()
+    for folder, lacks in ((tmp_path, r"has no train\*.py"), (tmp_path / "nowhere", "does not exist")):
+        with pytest.raises(UserInputError, match=rf"{folder} {lacks}, expected the root of a 3DGS checkout"):
+            lapgs("doctor", folder)
 
 
 def test_doctor_describes_a_checkout(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:

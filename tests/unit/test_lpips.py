@@ -210,3 +210,8 @@ def test_learned_layers_of_another_shape(tmp_path: Path) -> None:
 def test_an_unknown_variant_names_the_known_ones() -> None:
     with pytest.raises(UserInputError, match=r"--lpips vgg19: expected none, or some of vgg, alex, squeeze, vgg_3dgs"):
         LpipsRequest.parse("alex,vgg19")
+
+
+def test_weights_that_do_not_exist_are_refused_before_images_are_read(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match=r"--lpips-weights .*nowhere\.pth: no such file"):
+        LpipsRequest.parse(None, [tmp_path / "nowhere.pth"])

@@ -26,13 +26,19 @@ class PrepareSettings:
         UserInputError: a value is unknown or out of range.
     """
 
-    model: Path | None = option(
-        None,
-        "Folder of a COLMAP model of the photos, such as sparse/0: take its cameras and only undistort. Default: the "
-        "model in PHOTOS, if there is one.",
-    )
     max_size: int | None = option(
         None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
+    )
+    frames: int | None = option(None, "Frames to pick from a video. Default: two a second, 40 to 240.", least=2)
+    masks: Path | None = option(
+        None,
+        "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
+        "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
+    )
+    camera_model: str = option(
+        AUTO,
+        "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
+        "OPENCV, and SIMPLE_RADIAL if that places few photos or gives implausible focal lengths.",
     )
     matcher: str = option(
         AUTO,
@@ -46,23 +52,17 @@ class PrepareSettings:
         "How cameras are placed. incremental: one after the other. global: all at once.",
         choices=(INCREMENTAL, GLOBAL),
     )
-    camera_model: str = option(
-        AUTO,
-        "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
-        "OPENCV, and SIMPLE_RADIAL if that places few photos or gives implausible focal lengths.",
-    )
     single_camera: bool | None = option(
         None,
         "Fit one camera to all photos, or one to each group of photos with the same EXIF data. Default: one camera if "
         "all photos have the same size and camera.",
         names=("--single-camera/--own-cameras",),
     )
-    masks: Path | None = option(
+    model: Path | None = option(
         None,
-        "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
-        "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
+        "Folder of a COLMAP model of the photos, such as sparse/0: take its cameras and only undistort. Default: the "
+        "model in PHOTOS, if there is one.",
     )
-    frames: int | None = option(None, "Frames to pick from a video. Default: two a second, 40 to 240.", least=2)
 
     def __post_init__(self) -> None:
         if self.camera_model != AUTO:
