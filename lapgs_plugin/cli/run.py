@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
     from lapgs_plugin.runs.watcher import Watcher
 
-OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose"}
+OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose", "seed"}
 """Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -133,6 +133,7 @@ def _execute(
     """Execute the script: with a hierarchy, or unchanged with --off."""
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.checkouts.seeds import moved_seeds
     from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
@@ -145,7 +146,7 @@ def _execute(
         neighbours = kind is not None and CheckoutSource.read(script).unpacks("distCUDA2")
         on_device = cuda_on_cpu(variant, neighbours=neighbours)
     try:
-        with on_device, loaded_script(script, arguments) as loaded:
+        with on_device, moved_seeds(settings.seed), loaded_script(script, arguments) as loaded:
             if kind is None or (options.off and not options.record):
                 loaded.run_main()
                 return

@@ -130,8 +130,9 @@ def run_steps(
         steps = [Step(_train(spec, scene, folder), str(folder.parent))]
     else:
         bare = spec.method == "bare"
-        how = ("--off", "--record") if bare else ("--overwrite", "--seed", str(spec.seed))
-        command = *LAPGS, "run", *how, *_as_options(spec.options), *_script(spec, scene, checkout, folder)
+        how = ("--off", "--record") if bare else ("--overwrite",)
+        options = "--seed", str(spec.seed), *_as_options(spec.options)
+        command = *LAPGS, "run", *how, *options, *_script(spec, scene, checkout, folder)
         steps = [Step(command, str(checkout))]
         if bare and evaluate is not None:
             steps.append(Step(_import(spec, scene, checkout, folder), str(checkout)))

@@ -159,7 +159,7 @@ class HierarchySettings:
         panel=STORAGE,
         choices=(AUTO, *PRECISIONS),
     )
-    seed: int = option(0, "Seed of all random choices of lapgs.", panel="Run")
+    seed: int = option(0, "Seed of all random choices; added to the seeds that a checkout's script sets.", panel="Run")
 
     def __post_init__(self) -> None:
         check_values(self)

@@ -204,7 +204,7 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
         ),
         *(place, tmp_path, tmp_path / "r", []),
     )
-    assert training.command[3:7] == ("run", "--off", "--record", "--gpu-busy")
+    assert training.command[3:9] == ("run", "--off", "--record", "--seed", "0", "--gpu-busy")
     assert "--iterations" not in training.command, "30,000 is what the script does by itself"
     assert words_after(importing.command, "--set", "--out") == ["mult=0.7", str(tmp_path / "r" / "lapgs")]
 

@@ -1,0 +1,41 @@
+"""Let the seed of a run decide the random choices of a script that sets seeds of its own."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import Any
+
+import numpy as np
+import torch
+
+SEEDED: tuple[tuple[Any, str], ...] = ((random, "seed"), (np.random, "seed"), (torch, "manual_seed"))
+"""Functions that scripts seed generators with; the last seeds those of CUDA devices as well."""
+
+
+@contextmanager
+def moved_seeds(by: int) -> Iterator[None]:
+    """Add a number to the seeds that are set meanwhile. 3DGS and its forks set 0, whatever run it is.
+
+    Args:
+        by: from 0, which leaves seeds as they are, to below 2^32.
+    """
+    with ExitStack() as stack:
+        for owner, name in SEEDED if by else ():
+            seed = getattr(owner, name)
+            stack.callback(setattr, owner, name, seed)
+            setattr(owner, name, _moved(seed, by))
+        yield
+
+
+def _moved(seed: Callable[..., Any], by: int) -> Callable[..., Any]:
+    def sum_of(value: Any) -> Any:
+        return (value + by) % 2**32 if isinstance(value, int) else value
+
+    @wraps(seed)
+    def moved(*values: Any, **named: Any) -> Any:
+        return seed(*map(sum_of, values), **{name: sum_of(value) for name, value in named.items()})
+
+    return moved
