@@ -15,6 +15,7 @@ from lapgs_plugin.errors import (
     DeviceMemoryError,
     FieldError,
     LapgsError,
+    MissingExtraError,
     TrainingDivergedError,
     UserInputError,
     first_line,
@@ -215,7 +216,8 @@ class ActiveStage:
 
     def finish_despite(self, error: Exception) -> None:
         """Archive the field if a checkout's own error came with the last iteration or later, as of a report."""
-        if isinstance(error, LapgsError) or self.gaussians is None or self.iteration < self.stage.iterations:
+        refused = isinstance(error, LapgsError) and not isinstance(error, MissingExtraError)
+        if refused or self.gaussians is None or self.iteration < self.stage.iterations:
             return
         self.finish()
         logger.warning(
