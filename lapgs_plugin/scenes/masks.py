@@ -52,7 +52,8 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     Raises:
         SceneError: an image has no mask, or several.
     """
-    shorter = {name: name.removeprefix(common_folder(names)) for name in names}
+    common = common_folder(names)
+    shorter = {name: name.removeprefix(common) for name in names}
     parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
     places = [place for parent in parents if is_folder(place := folder / parent)]
     files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
