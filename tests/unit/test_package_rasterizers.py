@@ -79,7 +79,7 @@ def test_it_trains_renders_and_is_checked_by_its_name() -> None:
 
 
 def test_another_renders_what_was_trained_with_one_that_cannot_here(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", "lapgs_plugin.rasterizers.choice")
     assert rasterizer_for(manifest("on_gpu")).rasterizer.name == "cpu"
     assert "the fastest without a CUDA device, because --rasterizer on_gpu: my_rasterizers.OnGpu renders" in caplog.text
     assert rasterizer_for(manifest("of a package that is gone")).rasterizer.name == "cpu"
