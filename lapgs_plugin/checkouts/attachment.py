@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType, TracebackType
 from typing import Any
@@ -108,3 +109,21 @@ def _verify(replacement: Replacement) -> None:
             f"({', '.join(replacement.parameters)}); {changed}: choose another with --backbone, or train with "
             "`lapgs run --off`"
         )
+
+
+_NOT_THERE = object()
+
+
+@contextmanager
+def replaced(namespace: dict[str, Any], values: Mapping[str, object]) -> Iterator[None]:
+    """Set names to other values inside a `with` block, and restore them at its end."""
+    former = {name: namespace.get(name, _NOT_THERE) for name in values}
+    namespace.update(values)
+    try:
+        yield
+    finally:
+        for name, value in former.items():
+            if value is _NOT_THERE:
+                namespace.pop(name, None)
+            else:
+                namespace[name] = value

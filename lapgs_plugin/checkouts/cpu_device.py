@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import wraps
 from importlib import import_module
@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from lapgs_plugin.checkouts.absent_modules import absent_modules
+from lapgs_plugin.checkouts.attachment import replaced
 from lapgs_plugin.reference_raster.standins import VARIANTS, install
 
 __all__ = ["cuda_on_cpu"]
@@ -48,12 +49,12 @@ def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[No
         if variant is not None:
             stack.enter_context(install(variant, neighbours=neighbours))
         needs_logs = variant is not None and VARIANTS[variant].needs_logs
-        stack.enter_context(_replaced(sys.modules, absent_modules(needs_logs)))
-        stack.enter_context(_replaced(vars(torch.cuda), _WITHOUT_CUDA))
+        stack.enter_context(replaced(sys.modules, absent_modules(needs_logs)))
+        stack.enter_context(replaced(vars(torch.cuda), _WITHOUT_CUDA))
         on_cpu = {"load": _loading_to_cpu(torch.load), "Generator": _Generator}
-        stack.enter_context(_replaced(vars(torch), on_cpu))
+        stack.enter_context(replaced(vars(torch), on_cpu))
         mode = _CudaMeansCpu()
-        stack.enter_context(_replaced(vars(torch.autograd), _engine_within(mode)))
+        stack.enter_context(replaced(vars(torch.autograd), _engine_within(mode)))
         stack.enter_context(_threads_within(mode))
         stack.enter_context(mode)
         yield
@@ -242,20 +243,3 @@ _WITHOUT_CUDA: dict[str, object] = {
     "synchronize": _returns(None),
 }
 """Replacements of names in `torch.cuda`, also on a machine with CUDA."""
-
-_NOT_THERE = object()
-
-
-@contextmanager
-def _replaced(namespace: dict[str, Any], values: Mapping[str, object]) -> Iterator[None]:
-    """Set names to other values inside a `with` block, and restore them at its end."""
-    former = {name: namespace.get(name, _NOT_THERE) for name in values}
-    namespace.update(values)
-    try:
-        yield
-    finally:
-        for name, value in former.items():
-            if value is _NOT_THERE:
-                namespace.pop(name, None)
-            else:
-                namespace[name] = value

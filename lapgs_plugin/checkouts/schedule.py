@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, cast
 
-from lapgs_plugin.checkouts.training_call import StageWindow
+from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 RARE = 10
 """An iteration after 1/RARE of a run is late, and an event whose period is at least that is rare. Earlier iterations
@@ -334,6 +334,10 @@ class StageSchedule:
         if last > start:
             self._moved[_place(event.period.comparison)] = start
             self.notes.append(f"{', '.join(event.calls)} at {last} -> {start}")
+
+    def applied_to(self, call: TrainingCall) -> TrainingCall:
+        """Return a call with the options and numbers that changed."""
+        return replace(call, values=self.arguments(call.values), function=self.function(call.function))
 
     def arguments(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return a function's arguments with the options that changed; objects that hold them are copied."""

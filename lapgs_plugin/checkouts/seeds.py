@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from lapgs_plugin.checkouts.attachment import replaced
+
 SEEDED: tuple[tuple[Any, str], ...] = ((random, "seed"), (np.random, "seed"), (torch, "manual_seed"))
 """Functions that scripts seed generators with; the last seeds those of CUDA devices as well."""
 
@@ -24,9 +26,7 @@ def moved_seeds(by: int) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for owner, name in SEEDED if by else ():
-            seed = getattr(owner, name)
-            stack.callback(setattr, owner, name, seed)
-            setattr(owner, name, _moved(seed, by))
+            stack.enter_context(replaced(vars(owner), {name: _moved(getattr(owner, name), by)}))
         yield
 
 

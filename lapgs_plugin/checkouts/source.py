@@ -179,12 +179,15 @@ class CheckoutSource:
     @property
     def attributes(self) -> set[str]:
         """Names of attributes that its modules set or read."""
-        nodes = (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path)))
-        return {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+        return {node.attr for node in self._nodes() if isinstance(node, ast.Attribute)}
+
+    def _nodes(self) -> Iterator[ast.AST]:
+        """Yield every node of its modules."""
+        return (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path)))
 
     def unpacks(self, function: str) -> bool:
         """Return whether the checkout unpacks what a function of that name returns, or takes one of its results."""
-        for node in (node for path in self.modules.values() for node in ast.walk(parsed_quietly(path))):
+        for node in self._nodes():
             if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
                 call = node.value if isinstance(node.slice.value, int) else None
             else:

@@ -10,8 +10,7 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.runner.object_values import fields_of
-from lapgs_plugin.runner.signed_calls import DEGREES
+from lapgs_plugin.runner.signed_calls import seen_from
 from lapgs_plugin.runner.stage_rendering import Captured
 
 SAME_VALUE = 1e-3
@@ -67,12 +66,13 @@ def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
 
 def _has_other_colors(captured: Captured, field: GaussianField) -> bool:
     """Return whether the renderer evaluates colours that are not those of the field's SH, as by a network."""
-    given, settings = captured.inputs.get("colors_precomp"), fields_of(captured.settings)
-    degree = next((settings[name] for name in DEGREES if name in settings), None)
-    if not isinstance(given, Tensor) or given.shape != field.means.shape or degree is None or "campos" not in settings:
+    given = captured.inputs.get("colors_precomp")
+    if not isinstance(given, Tensor) or given.shape != field.means.shape:
         return False
-    field, degree = field.to(given.device), min(int(degree), field.sh_degree)
-    directions = torch.nn.functional.normalize(field.means - settings["campos"], dim=-1)  # (n, 3)
+    field = field.to(given.device)
+    if (seen := seen_from(captured.settings, field.means)) is None:
+        return False
+    directions, degree = seen[0], min(int(seen[1]), field.sh_degree)
     expected = (sh_to_color(field.sh, directions, degree, signed=signed) for signed in (False, True))
     return not any(torch.allclose(given.detach(), each, rtol=SAME_VALUE, atol=SAME_VALUE) for each in expected)
 

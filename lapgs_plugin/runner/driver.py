@@ -142,7 +142,7 @@ class HierarchyDriver:
             )
             if not self._has_residuals:
                 plan = between_events(plan, self._schedule, call.variables)
-            dry_run = DryRun(self._context, call, scene, plan)
+            dry_run = DryRun(self._context, call, scene, plan, self._schedule)
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
@@ -196,7 +196,7 @@ class HierarchyDriver:
         changed = self._schedule.for_stage(run.call.variables, call.values, window, self._adapter.info.unscaled)
         if changed.notes:
             logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
-        return replace(call, values=changed.arguments(call.values), function=changed.function(call.function))
+        return changed.applied_to(call)
 
     def _log_schedule(self, call: TrainingCall) -> None:
         lines = self._schedule.describe(call.variables)

@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +61,13 @@ class DryRun:
         call: the script's call of `training`.
         scene: the checkout's scene.
         plan: the stages.
+        schedule: of the script's training function.
     """
 
-    def __init__(self, context: RunContext, call: TrainingCall, scene: CheckoutScene, plan: StagePlan) -> None:
-        self._context, self._scene, self._plan = context, scene, plan
+    def __init__(
+        self, context: RunContext, call: TrainingCall, scene: CheckoutScene, plan: StagePlan, schedule: Schedule
+    ) -> None:
+        self._context, self._scene, self._plan, self._schedule = context, scene, plan, schedule
         self._adapter = context.adapter
         self._call = call
         self._captured: Captured | None = None  # the last render
@@ -149,10 +151,10 @@ class DryRun:
 
         The base would be trained before that is found out. What else fails does so because nothing led up to it.
         """
-        later = Schedule(self._adapter.profile.source.training).begun(self._call.variables, self._plan.iterations)
+        later = self._schedule.begun(self._call.variables, self._plan.iterations)
         if not later.notes:
             return
-        call = replace(call, values=later.arguments(call.values), function=later.function(call.function))
+        call = later.applied_to(call)
         try:
             with self._running(stage_of(call)):
                 call.run()

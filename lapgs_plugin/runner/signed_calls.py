@@ -42,16 +42,31 @@ def with_signed_colors(inputs: dict[str, Any], settings: Any) -> dict[str, Any]:
     """
     if inputs.get("colors_precomp") is not None:
         return inputs
-    fields = fields_of(settings)
-    degree = next((fields[name] for name in DEGREES if name in fields), None)
-    if not {"shs", "means3D"} <= inputs.keys() or degree is None or "campos" not in fields:
+    seen = seen_from(settings, inputs["means3D"]) if {"shs", "means3D"} <= inputs.keys() else None
+    if seen is None:
         raise UserInputError(
             f"the checkout's rasterizer takes {', '.join(inputs)}, expected means3D and shs, or colors_precomp, by "
             "which a residual has colours of both signs; train with --hierarchy nested"
         )
-    dc, rest, means = inputs.get("dc"), inputs["shs"], inputs["means3D"]
+    dc, rest, (directions, degree) = inputs.get("dc"), inputs["shs"], seen
     sh = rest if dc is None else torch.cat([dc, rest], dim=1)  # (n, k, 3)
-    directions = torch.nn.functional.normalize(means - fields["campos"], dim=-1)  # (n, 3)
     colors = sh_to_color(sh, directions, degree, signed=True)  # (n, 3)
     others = {name: value for name, value in inputs.items() if name not in ("dc", "shs")}
     return {**others, "colors_precomp": colors}
+
+
+def seen_from(settings: Any, means: Tensor) -> tuple[Tensor, int] | None:
+    """Return what a rasterizer that evaluates SH needs of its settings; None if they have no camera or SH degree.
+
+    Args:
+        settings: of the rasterizer.
+        means: (n, 3) of the Gaussians.
+
+    Returns:
+        Unit directions (n, 3) from the camera to the Gaussians, and the degree as the settings have it.
+    """
+    fields = fields_of(settings)
+    degree = next((fields[name] for name in DEGREES if name in fields), None)
+    if degree is None or "campos" not in fields:
+        return None
+    return torch.nn.functional.normalize(means - fields["campos"], dim=-1), degree
