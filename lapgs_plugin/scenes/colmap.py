@@ -47,6 +47,23 @@ def find_model(path: Path, places: Sequence[str] = MODEL_PLACES[:2]) -> Path | N
     return None
 
 
+def largest_model(path: Path, model: Path) -> Path:
+    """Return the model with the most photos of those that COLMAP's mapper numbers in `path`; `model` unless one has more.
+
+    The mapper writes a model for each group of photos that nothing connects, in the order in which it finds them.
+    """
+    beside = [each for place in MODEL_PLACES for each in sorted((path / place).parent.glob("[0-9]*"))]
+    return max([model, *beside], key=count_images)
+
+
+def count_images(model: Path) -> int:
+    """Return how many images a binary model has; 0 of other folders."""
+    if not all(is_file(model / f"{name}.bin") for name in MODEL_FILES):
+        return 0
+    with (model / "images.bin").open("rb") as stream:
+        return int.from_bytes(stream.read(8), "little")
+
+
 def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
     """Read the frames and points of a COLMAP scene.
 

@@ -15,8 +15,8 @@ from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
 from lapgs_plugin.scenes.blender import Lenses, has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_model, source_of
-from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, largest_model, read_model, source_of
+from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
@@ -69,16 +69,20 @@ class Given:
 def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
     """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
 
+    Of several models the largest is taken.
+
     Raises:
         UserInputError: --model names none.
     """
     if settings.model is None:
-        return find_model(photos, MODEL_PLACES) or (photos if has_transforms(photos) else None)
+        if (found := find_model(photos, MODEL_PLACES)) is not None:
+            return largest_model(photos, found)
+        return photos if has_transforms(photos) else None
     if (found := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
         raise UserInputError(
             f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and points3D"
         )
-    return found
+    return largest_model(settings.model, found)
 
 
 def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
@@ -104,7 +108,7 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         model.tear_down()  # of images without a pose, and cameras without images
         _check_lenses(model, place)
         source = source_of(model, place, photos)
-        folder = max((photos / name for name in FOLDERS), key=lambda folder: _present(source, folder))
+        folder = max((photos / name for name in FOLDERS), key=lambda folder: _fit(source, folder))
         frames = [replace(frame, path=find_image(folder / frame.name)) for frame in source.train]
     else:
         lenses: Lenses = {}
@@ -113,18 +117,17 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         frames = [replace(frame, name=frame.name.removeprefix(top)) for frame in source.train]
         model = _model_of(replace(source, train=tuple(frames)), lenses)
         _check_lenses(model, place)
-    kinds = {camera.model.name for camera in model.cameras.values()}
-    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}:
-        raise UserInputError(
-            f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
-            "cameras again, give a folder of photos without a model"
-        )
     there = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
     if frames and not there:
-        raise SceneError(
-            f"{folder}: none of the {len(frames)} photos of {place} is there, the first is {printable(left_out[0])}; "
-            "give the folder of the photos, and the model with --model"
+        advice = "put them there" if place == photos else "give the folder of the photos, and the model with --model"
+        first = min(frame.path for frame in frames)
+        raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
+    kinds, trained = {camera.model.name for camera in model.cameras.values()}, (photos, find_model(photos))
+    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"} and place in trained and not left_out:
+        raise UserInputError(
+            f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
+            "cameras again, give a folder of photos without a model"
         )
     check_source(photos, replace(source, train=there))
     check_targets(photos, [(frame.name, frame.name) for frame in there])
@@ -141,8 +144,13 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     return Given(model, there, Photos(folder, files), tuple(left_out), replace(settings, masks=masks, model=place))
 
 
-def _present(source: SceneSource, folder: Path) -> int:
-    return sum(is_file(find_image(folder / frame.name)) for frame in source.train)
+def _fit(source: SceneSource, folder: Path) -> tuple[int, bool]:
+    """Return how many photos of a model are in a folder, and whether the first of them has its camera's size.
+
+    3DGS's convert.py leaves photos in `input` and undistorted ones, which may have the same shape, in `images`.
+    """
+    there = [(file, frame) for frame in source.train if is_file(file := find_image(folder / frame.name))]
+    return len(there), any(image_size(file) == frame.camera.size for file, frame in there[:1])
 
 
 def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
