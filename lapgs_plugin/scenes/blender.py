@@ -8,6 +8,7 @@ frame (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from pathlib import Path, PurePosixPath
@@ -53,6 +54,8 @@ OBJECT_RADIUS = 1.3 / 4.03
 3DGS uses 1.3 for NeRF's objects, whose cameras are 4.03 away."""
 CAPTURE_RADIUS = 1.0
 """The same for a single transforms file, whose photos also show the surroundings."""
+
+logger = logging.getLogger(__name__)
 
 Values = dict[str, Any]
 Lenses = dict[Path, tuple[str, Values]]
@@ -280,6 +283,9 @@ def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[n
         )
     file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
     if file is None:
+        return None
+    if not is_file(file):  # nerfstudio, too, trains from random points then
+        logger.warning("%s names %s: no such file; random points are used instead of it", path / transforms, file)
         return None
     subject = f"{path / transforms} names {file}" if named else f"{file}"
     try:
