@@ -48,9 +48,9 @@ def find_model(path: Path, places: Sequence[str] = MODEL_PLACES[:2]) -> Path | N
 
 
 def largest_model(path: Path, model: Path) -> Path:
-    """Return the model with the most photos of those that COLMAP's mapper numbers in `path`; `model` unless one has more.
+    """Return `model`, or the one of the numbered models in the scene `path` that has most photos, if it has more.
 
-    The mapper writes a model for each group of photos that nothing connects, in the order in which it finds them.
+    COLMAP's mapper numbers a model for each group of photos that nothing connects as it finds them, not by size.
     """
     beside = [each for place in MODEL_PLACES for each in sorted((path / place).parent.glob("[0-9]*"))]
     return max([model, *beside], key=count_images)

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 
-from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
 from lapgs_plugin.scenes.blender import Lenses, has_transforms, read_transforms
