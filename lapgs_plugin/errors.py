@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import ClassVar
@@ -39,6 +40,16 @@ def counted(number: int, thing: str) -> str:
     ('1 photo', '0 photos')
     """
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def nearest(name: str, known: Set[str], otherwise: str = "") -> str:
+    """Suggest the nearest known name; without one say `otherwise`, or list all of them.
+
+    >>> nearest("iteratons", {"iterations", "seed"}), nearest("x", {"iterations", "seed"})
+    ('did you mean iterations?', 'expected one of iterations, seed')
+    """
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else otherwise or f"expected one of {', '.join(sorted(known))}"
 
 
 def joined(text: object) -> str:

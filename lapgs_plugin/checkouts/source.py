@@ -13,6 +13,7 @@ from pathlib import Path
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import executed_on_import, parsed, parsed_quietly, place
+from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import as_pip_argument
 
@@ -165,16 +166,35 @@ class CheckoutSource:
             return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
         if (several := self.image_scales) is not None:
             return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
-        return None
+        parameters = [each.arg for each in self.training.args.args]
+        absent_roles = (role for role in NEEDED if self._is_nested(role, parameters))
+        return next((lacks_role(self.training.name, parameters, role) for role in absent_roles), None)
+
+    def _is_nested(self, role: str, parameters: Collection[str]) -> bool:
+        """Return whether only parts of arguments have a role: training reads `cfg.opt.iterations`, no `opt.iterations`.
+
+        Args:
+            role: of `training_call.ROLES`.
+            parameters: of the training function.
+        """
+        nodes = (each for each in ast.walk(self.training) if isinstance(each, ast.Attribute))
+        holders = [ast.unparse(each.value).split(".") for each in nodes if each.attr in ROLES[role]]
+        depths = [len(names) for names in holders if names[0] in parameters]
+        return min(depths, default=1) > 1
 
     def unknown_attributes(self, names: Iterable[str]) -> list[str]:
         """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
-        trees = [parsed_quietly(path) for path in self.modules.values()]
-        classes = {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
+        classes = self.classes
         if not _methods(classes[self.model[0]], classes)[1]:
             return []
         known = self.attributes
         return [name for name in names if name not in known]
+
+    @property
+    def classes(self) -> dict[str, ast.ClassDef]:
+        """Classes of its modules by name."""
+        trees = [parsed_quietly(path) for path in self.modules.values()]
+        return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
 
     @property
     def attributes(self) -> set[str]:

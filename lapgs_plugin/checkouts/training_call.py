@@ -27,8 +27,19 @@ ROLES = {
 The first such argument has the role, one with all of the script's options only if there is no other.
 """
 
+NEEDED = ("dataset", "opt")
+"""Roles without which no call can be trained in levels."""
+
 CHECKPOINTS = ("checkpoint", "start_checkpoint")
 """Parameters of `training` for a checkpoint to start from."""
+
+
+def lacks_role(function: str, parameters: Iterable[str], role: str) -> str:
+    """Return a clause that says that no argument of a call has a role of `NEEDED`."""
+    return (
+        f"{function}({', '.join(parameters)}) of the script has no argument with {ROLES[role][0]}, expected one as "
+        f"{role} has in 3DGS"
+    )
 
 
 @dataclass(frozen=True)
@@ -69,11 +80,10 @@ class TrainingCall:
             role: next((name for name in names if any(hasattr(values[name], a) for a in attributes)), None)
             for role, attributes in ROLES.items()
         }
-        for role in ("dataset", "opt"):
+        for role in NEEDED:
             if found[role] is None:
                 raise UserInputError(
-                    f"{function.__name__}({', '.join(values)}) of the script got no argument with "
-                    f"{ROLES[role][0]}, expected one as {role} has in 3DGS; `lapgs run --off` runs the script as it is"
+                    f"{lacks_role(function.__name__, values, role)}; `lapgs run --off` runs the script as it is"
                 )
         return cls(function, values, {role: name for role, name in found.items() if name is not None})
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from lapgs_plugin import __version__
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, nearest
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.runs.layout import RUN_CONFIG
@@ -50,14 +50,15 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise UserInputError(f"--config {path}: no such file; a run folder has one, {RUN_CONFIG}")
-    known = {each.name for each in context.command.params} - OF_ONE_CALL
+    known = {str(each.name).replace("_", "-") for each in context.command.params if each.name not in OF_ONE_CALL}
     values: dict[str, Any] = {}
     for key, value in read_toml(path, dict[str, Any]).items():
         name = key.replace("-", "_")
-        if name not in known:
+        if (option := name.replace("_", "-")) not in known:
+            all_of_them = f"{context.command_path} --help lists them"
             raise UserInputError(
                 f"{path}: {key} is not an option of {context.command_path} that a settings file may have; "
-                f"{context.command_path} --help lists them"
+                f"{all_of_them if name in OF_ONE_CALL else nearest(option, known, all_of_them)}"
             )
         if not isinstance(value, str | int | float):
             raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from lapgs_plugin.adapters.base import PARAMETERS
 from lapgs_plugin.adapters.registry import adapter_class, known_extensions
+from lapgs_plugin.checkouts.model_values import explain_values_beside
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
@@ -123,6 +125,8 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
     axes = source.scale_axes
     if axes is not None and axes[0] != 3:
         return [nested, Finding("laplacian", "absent", f"residuals need three scale axes; {axes[1]} makes {axes[0]}")]
+    if why := explain_values_beside(source, PARAMETERS):
+        return [nested, Finding("laplacian", "absent", why)]
     blind = [module for module, inputs in taken.items() if not inputs]
     if len(blind) < len(taken):
         takes = " and ".join(sorted(set[str]().union(*taken.values())))

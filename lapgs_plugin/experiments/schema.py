@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, nearest
 from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
@@ -273,12 +272,6 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
 def _first_duplicate(names: Sequence[T]) -> T | None:
     """Return the first item that occurs twice."""
     return next((name for name in names if names.count(name) > 1), None)
-
-
-def nearest(name: str, known: Set[str]) -> str:
-    """Suggest the nearest known name, or list all of them."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(sorted(known))}"
 
 
 def _problems(error: ValidationError) -> list[str]:

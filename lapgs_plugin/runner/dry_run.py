@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
-from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.level_views import shrunk
+from lapgs_plugin.checkouts.model_values import explain_values_beside
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
@@ -124,6 +125,7 @@ class DryRun:
             self._step(
                 "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_MAY_WORK
             ),
+            self._values_beside_explained(),
         ):
             gaussians = self._adapter.new_model(self._call)
             gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
@@ -234,6 +236,18 @@ class DryRun:
                 f"{self._adapter.profile.source.model[1]}: a field is archived from {', '.join(needed)}; the model "
                 f"has no {', '.join(absent)}; {OFF}"
             )
+
+    @contextmanager
+    def _values_beside_explained(self) -> Iterator[None]:
+        """Name what the checkout renders besides a field's parameters as the cause of an error, if it does so."""
+        try:
+            yield
+        except (LapgsError, torch.cuda.OutOfMemoryError):
+            raise
+        except Exception as error:
+            if why := explain_values_beside(self._adapter.profile.source, PARAMETERS):
+                raise UserInputError(f"no residuals: {why}; {NESTED_MAY_WORK}") from error
+            raise
 
     def _require_settable(self, gaussians: Any) -> None:
         """Refuse a model whose parameters are computed, which cannot start from a finished field."""

@@ -38,3 +38,14 @@ def test_shapes_that_fill_no_warp_are_refused(shapes: str) -> None:
 
     with pytest.raises(UserInputError, match=f"--shapes '{shapes}': expected"):
         parse_shapes(shapes)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+def test_shapes_that_look_ahead() -> None:
+    from lapgs_plugin.evaluation.bench_blend import parse_shapes
+    from lapgs_plugin.rasterizers.gsplat.blend_kernels import SHAPE, Shape
+
+    assert list(parse_shapes("8x4x4x2+ahead, 4x2x8x1").values()) == [Shape(ahead=True), Shape(4, 2, 8, 1)]
+    assert list(parse_shapes(None).values()) == [SHAPE]
+    with pytest.raises(UserInputError, match="at most 32 regions in a tile, not 64; make LANES or ROWS larger"):
+        parse_shapes("2x2x16x2+ahead")

@@ -115,8 +115,10 @@ def test_files_of_older_versions_name_strategies_as_they_are_now(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("iteratons = 5", "iteratons is not an option of"),
-        ('out = "elsewhere"', "out is not an option of"),
+        ("iteratons = 5", r"iteratons is not an option of .*; did you mean iterations\?"),
+        ("views_per_stp = 2", r"views_per_stp is not an option of .*; did you mean views-per-step\?"),
+        ("foo = 5", "foo is not an option of .*; .* --help lists them"),
+        ('out = "elsewhere"', "out is not an option of .*; .* --help lists them"),
         ("levels = [2]", r"levels is \[2\], expected a string, a number, true or false"),
         ('levels = "two"', "--levels two: expected a valid integer"),
         ("levels 2", "is not TOML"),

@@ -181,7 +181,7 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     assert (own.model_path, own.white_background, cfg.model_path) == ("run/level_0", False, "out")
     assert (changed.iterations, changed.feature_lr, changed.densify_grad_threshold) == (20, 0.4, 0.4)
     assert (visualized, gui) == ([5], True)
-    with pytest.raises(UserInputError, match=r"training\(cfg, options, .* got no argument with source_path") as caught:
+    with pytest.raises(UserInputError, match=r"training\(cfg, options, .* has no argument with source_path") as caught:
         TrainingCall.bind(training, (1, options, []), {})
     assert "\n" not in str(caught.value)
 
@@ -324,6 +324,46 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     model.write_text("\n".join(lines) + "\n", encoding="utf-8")
     lapgs("doctor", fork)
     assert f"residuals need three scale axes; scene/gaussian_model.py:{len(lines)} makes 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("reads", "said"),
+    [
+        ("len(pc.exposure_mapping)", "exposure_mapping"),
+        ("helper(pc)", "pretrained_exposures"),
+        ("helper(pc) if pipe.debug else None", None),
+        ("pc.max_radii2D", None),
+    ],
+)
+def test_doctor_says_what_a_model_is_rendered_with_beside_parameters(
+    reads: str, said: str | None, fork: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As DNGaussian's network and the SH degrees of Reduced-3DGS; what options may turn off is not known to matter."""
+    renderer, start = fork / "gaussian_renderer" / "__init__.py", "    screenspace_points = "
+    text = renderer.read_text(encoding="utf-8")
+    assert text.count(start) == 1
+    helper = "\n\ndef helper(pc):\n    return pc.pretrained_exposures\n"
+    renderer.write_text(text.replace(start, f"    {reads}\n{start}") + helper, encoding="utf-8")
+    lapgs("doctor", fork)
+    shown = capsys.readouterr().out
+    assert "one call of the checkout's own training" in shown
+    assert (f"are rendered with {said}, which create_from_pcd() makes and fields do not have" in shown) == bool(said)
+    assert ("its rasterizer takes colors_precomp and shs" in shown) != bool(said)
+
+
+def test_options_in_one_tree_have_no_levels(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As of Self-Organizing Gaussians: `lapgs run` refused it in the middle of its main block."""
+    script = fork / "scripts" / "train.py"
+    text, start = script.read_text(encoding="utf-8"), "    first_iter = 0\n"
+    assert text.count(start) == 1
+    why = r"training\(dataset, opt, .*\) of the script has no argument with source_path, expected one as dataset has"
+    for reads, count in (("dataset.source_path, dataset.parts.source_path", 0), ("dataset.parts.source_path", 2)):
+        own = text.replace("dataset.source_path", "None").replace(start, f"{start}    print({reads})\n")
+        script.write_text(own, encoding="utf-8")
+        lapgs("doctor", fork)
+        assert len(re.findall(why, capsys.readouterr().out)) == count
+    with pytest.raises(UserInputError, match=f"cannot be trained in levels: {why}.* --off"):
+        lapgs("run", "--device", "cpu", script)
 
 
 def test_a_model_that_lacks_what_fields_have(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,6 +42,7 @@ class Blended(NamedTuple):
     images: Tensor  # (c, h, w, 3)
     alphas: Tensor  # (c, h, w, 1), empty if our kernels blended
     last: Tensor  # (c, h, w) the last pair of each pixel by gsplat, or the counts of `blend_forward`
+    reached: Tensor  # (p,) of `blend_forward`, empty if gsplat's kernels blended
 
 
 Gradients = tuple[Tensor, ...]
@@ -70,10 +71,11 @@ def blend(given: ToBlend, size: tuple[int, int], ours: bool) -> Blended:
     if ours:
         from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
 
-        images, counts = blend_forward(*given, size)
-        return Blended(images, images.new_empty(0), counts)
+        images, *rest = blend_forward(*given, size)
+        return Blended(images, images.new_empty(0), *rest)
     forward = bindings.compiled_functions().rasterize_to_pixels_3dgs_fwd
-    return Blended(*forward(*given[:5], None, *size, TILE, *given[5:]))
+    images, alphas, last = forward(*given[:5], None, *size, TILE, *given[5:])
+    return Blended(images, alphas, last, given.flat.new_empty(0))
 
 
 def gradients(given: ToBlend, blended: Blended, by_images: Tensor, absolute: bool) -> Gradients:
@@ -88,7 +90,7 @@ def gradients(given: ToBlend, blended: Blended, by_images: Tensor, absolute: boo
     if len(blended.alphas) == 0:
         from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward
 
-        rest = blended.last, blended.images, by_images
+        rest = blended.images, blended.last, blended.reached, by_images
         return blend_backward(*given[:4], given.offsets, given.flat, *rest, absolute)
     _, height, width, _ = by_images.shape
     found: Gradients = bindings.compiled_functions().rasterize_to_pixels_3dgs_bwd(

@@ -48,6 +48,8 @@ class Shape(NamedTuple):
         splats: Gaussians in the registers of a thread.
         warps: of a program.
         batch: pairs that a program tests at once for whether they reach its region; at least a bucket.
+        ahead: whether one launch before finds the regions that each pair reaches. Otherwise each region reads and tests
+            all Gaussians of its tile, in both passes.
     """
 
     lanes: int = 8
@@ -56,9 +58,19 @@ class Shape(NamedTuple):
     splats: int = 2
     warps: int = 1
     batch: int = 32
+    ahead: bool = False
+
+    @property
+    def regions(self) -> int:
+        """Number of regions in a tile."""
+        return (TILE // self.lanes) * (TILE // self.rows)
 
 
 SHAPE = Shape()
+MOST_REGIONS = 32
+"""Regions of a tile that the bits of a number can tell apart."""
+REACH_BATCH, REACH_WARPS = 128, 4
+"""Pairs that a program of the launch before tests at once, and its warps."""
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -150,12 +162,40 @@ def _region(
     return index, index // tiles, row, column
 
 
+@triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # type: ignore[untyped-decorator]  # no types
+def _reach_kernel(
+    means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor, offsets: tl.tensor, flat: tl.tensor,
+    reached: tl.tensor, across: int, tiles: int, all_tiles: int, pairs: int,
+    lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, batch: tl.constexpr,
+) -> None:  # fmt: skip
+    """Set a bit of each pair for each region of its tile that it reaches."""
+    index = tl.program_id(0)
+    row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
+    begin = tl.load(offsets + index)
+    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    while begin < stop:
+        pair = begin + tl.arange(0, batch)
+        there = pair < stop
+        gaussian = tl.load(flat + pair, there, 0)
+        x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
+        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
+        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+        found = tl.zeros((batch,), tl.int32)
+        for region in tl.static_range((tile // lanes) * (tile // rows)):
+            left, top = region % (tile // lanes) * lanes, region // (tile // lanes) * rows
+            found |= _reaches(x - left, y - top, a, b, c, opacity, lanes, rows).to(tl.int32) << region
+        tl.store(reached + pair, found.to(reached.dtype.element_ty), there)
+        begin += batch
+
+
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _fill(
     queue: tl.tensor, begin: tl.tensor, stop: tl.tensor, head: tl.tensor, tail: tl.tensor,
-    flat: tl.tensor, means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
+    flat: tl.tensor, reached: tl.tensor, means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
     row: tl.tensor, column: tl.tensor,
-    bucket: tl.constexpr, lanes: tl.constexpr, rows: tl.constexpr, batch: tl.constexpr,
+    bucket: tl.constexpr, lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, batch: tl.constexpr,
+    ahead: tl.constexpr,
 ) -> tuple[tl.tensor, tl.tensor]:  # fmt: skip
     """Put Gaussians that reach the region in the queue, until it has a bucket of them or the pairs end.
 
@@ -167,11 +207,16 @@ def _fill(
     while (begin < stop) & (tail - head < bucket):
         there = begin + in_batch < stop
         gaussian = tl.load(flat + begin + in_batch, there, 0)
-        x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
-        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
-        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-        wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
+        if ahead:
+            region = tl.program_id(0) % ((tile // lanes) * (tile // rows))
+            bits = tl.load(reached + begin + in_batch, there, 0).to(tl.int32)
+            wanted = (bits >> region) & 1 != 0
+        else:
+            x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
+            y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
+            a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
+            c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
+            wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
         slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (size - 1)
         tl.debug_barrier()  # all threads have read the bucket before
         tl.store(queue + slot, gaussian, wanted)
@@ -195,10 +240,10 @@ def _alphas(
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _forward_kernel(
     means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor, background: tl.tensor,
-    offsets: tl.tensor, flat: tl.tensor, images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
+    offsets: tl.tensor, flat: tl.tensor, reached: tl.tensor, images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
     lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
-    tile: tl.constexpr, batch: tl.constexpr,
+    tile: tl.constexpr, batch: tl.constexpr, ahead: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
     bucket: tl.constexpr = splats * splat_lanes
@@ -219,8 +264,9 @@ def _forward_kernel(
     head, tail = 0, 0
     while (begin < stop) | (head < tail):
         begin, tail = _fill(
-            queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
-        )
+            queue, begin, stop, head, tail, flat, reached, means2d, conics, opacities, row, column,
+            bucket, lanes, rows, tile, batch, ahead,
+        )  # fmt: skip
         there = head + order < tail
         gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
         head += bucket
@@ -257,12 +303,13 @@ def _forward_kernel(
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _backward_kernel(
     means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor,
-    offsets: tl.tensor, flat: tl.tensor, counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
+    offsets: tl.tensor, flat: tl.tensor, reached: tl.tensor, counts: tl.tensor, images: tl.tensor,
+    by_images: tl.tensor,
     by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
     queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
     lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
-    tile: tl.constexpr, batch: tl.constexpr, absolute: tl.constexpr,
+    tile: tl.constexpr, batch: tl.constexpr, ahead: tl.constexpr, absolute: tl.constexpr,
 ) -> None:  # fmt: skip
     # Tensors have the axes (lanes, splat_lanes, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
@@ -289,8 +336,9 @@ def _backward_kernel(
     head, tail = 0, 0  # numbers of Gaussians that left the queue and that entered it
     while head < count:
         begin, tail = _fill(
-            queue, begin, stop, head, tail, flat, means2d, conics, opacities, row, column, bucket, lanes, rows, batch
-        )
+            queue, begin, stop, head, tail, flat, reached, means2d, conics, opacities, row, column,
+            bucket, lanes, rows, tile, batch, ahead,
+        )  # fmt: skip
         there = head + order < tail
         gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
         there_of_sums = head + order_of_sums < tail
@@ -330,7 +378,7 @@ def _backward_kernel(
 def blend_forward(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, background: Tensor,
     offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Blend the Gaussians of each tile; arguments are contiguous.
 
     Args:
@@ -342,30 +390,37 @@ def blend_forward(
         shape: of a program's work.
 
     Returns:
-        Images (c, h, w, 3), and the number of Gaussians in each region that reach it before all its pixels end.
+        Images (c, h, w, 3); the number of Gaussians in each region that reach it before all its pixels end; and the
+        regions that each pair reaches, empty if the shape does not look `ahead`.
     """
     width, height = size
     programs, numbers = _launch_of(offsets, flat, size, shape)
+    reached = flat.new_empty(len(flat) if shape.ahead else 0, dtype=torch.int16 if shape.regions <= 16 else torch.int32)
+    if shape.ahead:
+        _reach_kernel[(offsets.numel(),)](
+            means2d, conics, opacities, offsets, flat, reached, *numbers[2:],
+            lanes=shape.lanes, rows=shape.rows, tile=TILE, batch=REACH_BATCH, num_warps=REACH_WARPS, **FUSED,
+        )  # fmt: skip
     images = means2d.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
-        means2d, conics, colors, opacities, background, offsets, flat, images, counts,
+        means2d, conics, colors, opacities, background, offsets, flat, reached, images, counts,
         flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, num_warps=shape.warps, **FUSED,
+        tile=TILE, batch=shape.batch, ahead=shape.ahead, num_warps=shape.warps, **FUSED,
     )  # fmt: skip
-    return images, counts
+    return images, counts, reached
 
 
 def blend_backward(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, counts: Tensor,
-    images: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, images: Tensor,
+    counts: Tensor, reached: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Return the gradients of blending by centres, conics, colours and opacities; arguments are contiguous.
 
     Args:
         means2d, conics, colors, opacities, offsets, flat: as `blend_forward` takes them.
-        counts, images: its results, made with a shape of the same lanes and rows.
+        images, counts, reached: its results, made with the same shape.
         by_images: gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
@@ -384,11 +439,11 @@ def blend_backward(
     programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), shape)
     assert len(counts) == programs
     _backward_kernel[(programs,)](
-        means2d, conics, colors, opacities, offsets, flat, counts, images, by_images,
+        means2d, conics, colors, opacities, offsets, flat, reached, counts, images, by_images,
         by_means2d, by_absolute, by_conics, by_colors, by_opacities,
         flat.new_empty(programs, 2 * shape.batch), *numbers,
         lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, absolute=absolute, num_warps=shape.warps, **FUSED,
+        tile=TILE, batch=shape.batch, ahead=shape.ahead, absolute=absolute, num_warps=shape.warps, **FUSED,
     )  # fmt: skip
     return by_absolute, by_means2d, by_conics, by_colors, by_opacities
 
@@ -397,4 +452,4 @@ def _launch_of(offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shap
     """Return the number of programs and the arguments named in `NOT_SPECIALIZED`."""
     all_tiles, across = offsets.numel(), offsets.shape[-1]
     numbers = *size, across, offsets[0].numel(), all_tiles, len(flat)
-    return all_tiles * (TILE // shape.lanes) * (TILE // shape.rows), numbers
+    return all_tiles * shape.regions, numbers

@@ -137,8 +137,8 @@ class _Render(torch.autograd.Function):
         from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
 
         means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
-        given, blended = ToBlend(*rest[:7]), Blended(*rest[7:10])
-        found, (width, height) = Intermediates(given, blended, *rest[10:]), ctx.size
+        given, blended = ToBlend(*rest[:7]), Blended(*rest[7:11])
+        found, (width, height) = Intermediates(given, blended, *rest[11:]), ctx.size
         by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
