@@ -172,7 +172,7 @@ def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Len
             lenses[image] = lens
         elif lens[0] not in PINHOLE_MODELS or lens[1]:
             terms = "".join(f", {key} = {value}" for key, value in lens[1].items())
-            raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path)}")
+            raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path, lens[0])}")
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
         camera = read_camera(posed, where)

@@ -77,14 +77,16 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
     reconstruction = read_model(model)
-    folder = path / images
-    if not is_folder(folder):
-        others = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
-        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
-        raise SceneError(f"{folder}: no such folder of images; {hint}")
     for key in sorted({image.camera_id for image in reconstruction.images.values() if image.has_pose}):
         _refuse_distortion(reconstruction.cameras[key], model, path)
+    folder = path / images
     source = source_of(reconstruction, model, folder)
+    if not is_folder(folder):
+        inside = [*sorted(each.name for each in path.iterdir() if each.is_dir()), "."]
+        first = [frame.name for frame in source.train[:1]]
+        others = [each for each in inside for name in first if is_file(find_image(path / each / name))]
+        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
+        raise SceneError(f"{folder}: no such folder of images; {hint}")
     train, test = hold_out(source.train, evaluate)
     return replace(source, train=train, test=test)
 
@@ -151,7 +153,8 @@ def _refuse_distortion(camera: pycolmap.Camera, model: Path, scene: Path) -> Non
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     if kind not in PINHOLE_MODELS or any(distortion):
         values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
-        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {undistort_hint(scene)}")
+        hint = undistort_hint(scene, kind)
+        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {hint}")
 
 
 def _intrinsics(camera: pycolmap.Camera) -> Camera:

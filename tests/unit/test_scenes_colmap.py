@@ -332,6 +332,13 @@ def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: st
     assert_one_line(caught)
 
 
+def test_photos_that_see_all_around_cannot_be_undistorted(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(cameras={1: "EQUIRECTANGULAR 96 64 96 64"}))
+    with pytest.raises(SceneError, match="sees all around, which no pinhole image shows; cut") as caught:
+        load(path)
+    assert "lapgs prepare" not in str(caught.value)
+
+
 def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:
     model, names = pycolmap.Reconstruction(), [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     for key, name in enumerate(names, start=1):
@@ -444,7 +451,11 @@ def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
     with pytest.raises(SceneError, match="images_4: no such folder of images; choose images with --images"):
         load(path, images="images_4")
-    shutil.rmtree(path / "images")
+    (path / "images").rename(path / "Fotos März")
+    with pytest.raises(SceneError, match="images: no such folder of images; choose Fotos März with --images"):
+        load(path)
+    assert len(load(path, images="Fotos März").train) == len(Model().names)
+    shutil.rmtree(path / "Fotos März")
     with pytest.raises(SceneError, match="images: no such folder of images; put the photos"):
         load(path)
 

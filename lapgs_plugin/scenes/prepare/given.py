@@ -21,7 +21,7 @@ from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.scene import check_shape, check_source
-from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource
+from lapgs_plugin.scenes.source import ALL_AROUND, ALL_AROUND_HINT, PINHOLE_MODELS, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
 """Where the photos of these models are."""
@@ -167,8 +167,8 @@ def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _check_lenses(model: pycolmap.Reconstruction, place: Path) -> None:
     for key, camera in model.cameras.items():
         who = f"{place}: camera {key} ({camera.model.name})"
-        if camera.model.name == "EQUIRECTANGULAR":
-            raise SceneError(f"{who} sees all around, which no pinhole image shows; cut its photos into several first")
+        if camera.model.name == ALL_AROUND:
+            raise SceneError(f"{who}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
 
@@ -195,6 +195,8 @@ def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> t
     """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
     if kind in PINHOLE_MODELS and not distortion:
         return "PINHOLE", []
+    if kind == ALL_AROUND:
+        raise SceneError(f"{frame.path}: its camera is {kind}: {ALL_AROUND_HINT}")
     model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
     values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
     if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):
