@@ -18,7 +18,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, count_images, find_model, largest_model, read_colmap
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, missing_image, read_as_3dgs, read_image, same_shape
 from lapgs_plugin.scenes.masks import (
     ALPHA,
@@ -129,7 +129,8 @@ def load_scene(
     path = Path(path)
     masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
-    _warn_of_a_larger_model(path)
+    for warning in source.warnings:
+        logger.warning(warning)
     frames = [*source.train, *source.test]
     mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]
@@ -230,15 +231,6 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
         )
     check_source(path, source)
     return source
-
-
-def _warn_of_a_larger_model(path: Path) -> None:
-    model = find_model(path)
-    if model is not None and (larger := largest_model(path, model)) != model:
-        logger.warning(
-            "%s places %d photos and %s %d; make a scene of the latter with `lapgs prepare %s OUT`",
-            *(model, count_images(model), larger, count_images(larger), quote(str(path))),
-        )
 
 
 def _what_to_give(path: Path) -> str:

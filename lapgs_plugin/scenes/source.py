@@ -56,6 +56,7 @@ class SceneSource:
         train, test: in name order.
         points: (n, 3) float64 positions in world units.
         colors: (n, 3) float64 RGB in [0, 1].
+        warnings: lines for whoever trains on the scene.
     """
 
     kind: str
@@ -63,6 +64,7 @@ class SceneSource:
     test: tuple[Frame, ...]
     points: NDArray[np.float64]  # (n, 3)
     colors: NDArray[np.float64]  # (n, 3)
+    warnings: tuple[str, ...] = ()
 
 
 def undistort_hint(scene: Path, model: str) -> str:

@@ -276,7 +276,7 @@ def test_a_ply_that_is_not_there_is_told(tmp_path: Path, name: str, caplog: pyte
     assert not caplog.records
     edit(tmp_path, {"ply_file_path": name})
     assert torch.equal(load(tmp_path).points, random)
-    assert "no such file; random points are used instead of it" in caplog.text
+    assert "no such file; training starts from random points" in caplog.text
 
 
 def test_points_with_float_colors_or_none(tmp_path: Path) -> None:

@@ -131,6 +131,8 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         )
     check_source(photos, replace(source, train=there))
     check_targets(photos, [(frame.name, frame.name) for frame in there])
+    for warning in source.warnings:
+        logger.warning(warning)
     if left_out:
         logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
     frame_of = {image.name: image.frame_id for image in model.images.values()}
