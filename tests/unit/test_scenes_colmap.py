@@ -249,6 +249,21 @@ def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: b
         load(path)
 
 
+def test_smaller_copies_may_have_another_format(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(("a.1.JPG", "a.2.JPG", "b/c.jpg")))
+    copies = {"a.1.png": (24, 16), "a.2.PNG": (24, 16), "b/c.tif": (24, 16)}
+    write_images(path / "images_4_png", copies)
+    (path / "images_4_png" / "a.1.txt").write_text("no photo")
+    scene = load(path, images="images_4_png")
+    assert [view.name for view in scene.train] == ["a.1.JPG", "a.2.JPG", "b/c.jpg"]
+    for view, name in zip(scene.train, copies, strict=True):
+        assert view.camera.size == (24, 16)
+        torch.testing.assert_close(view.image, torch.full((3, 16, 24), sum(name.encode()) % 256 / 255.0))
+    (path / "images_4_png" / "a.1.bmp").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"images_4_png/a\.1\.JPG: no such image"):
+        load(path, images="images_4_png")
+
+
 def test_two_names_of_one_photo_are_refused(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(("a.png", "A.png", "c.png")))
     (path / "images" / "A.png").unlink()
