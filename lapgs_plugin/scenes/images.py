@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, joined
-from lapgs_plugin.files import is_file, is_folder, whole_file
+from lapgs_plugin.files import is_file, is_folder, refuse_lfs_pointer, whole_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 
 JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
@@ -333,6 +333,7 @@ def _open(path: Path) -> oiio.ImageInput:
     source = oiio.ImageInput.open(str(path), options)
     if source is None:
         reason = joined(oiio.geterror())
+        refuse_lfs_pointer(path, SceneError)
         raise SceneError(f"{path}: not a readable image ({reason}), expected JPEG, PNG, TIFF or EXR; replace the file")
     return source
 

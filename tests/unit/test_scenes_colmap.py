@@ -477,6 +477,17 @@ def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.mark.parametrize(
+    "name", ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "images/06.png"]
+)
+def test_files_that_a_clone_without_git_lfs_lacks(tmp_path: Path, name: str) -> None:
+    path = make_scene(tmp_path)
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 128\n"
+    (path / name).write_text(pointer)
+    with pytest.raises(SceneError, match=rf"{name}: a pointer of Git LFS, .*`git lfs pull`"):
+        load(path)
+
+
 @pytest.mark.parametrize("how", ["missing", "empty", "cut"])
 def test_image_that_cannot_be_read_is_named(tmp_path: Path, how: str) -> None:
     path = make_scene(tmp_path)
