@@ -75,9 +75,9 @@ def _any_format(file: Path) -> str:
     return f"{_plain(file.stem)}.*"
 
 
-def missing_image(path: Path, more: str = "") -> SceneError:
-    """Return the error for an image that is not there; `more` follows."""
-    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images")
+def missing_image(path: Path, more: str = "", advice: str = "") -> SceneError:
+    """Return the error for an image that is not there; `more` follows, and `advice` at the end."""
+    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images{advice}")
 
 
 def image_size(path: Path) -> tuple[int, int]:

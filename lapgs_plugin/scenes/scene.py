@@ -241,6 +241,9 @@ def _what_to_give(path: Path) -> str:
     folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
+    if find_model(path, (".",)) is not None:
+        folder = quote(str(path))
+        return f"make a scene of its photos and its model with `lapgs prepare {folder} OUT --model {folder}`"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
     photos = next(
         (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
@@ -266,7 +269,9 @@ def check_source(path: Path, source: SceneSource) -> None:
     if (double := next((each.name for each in frames if uses[each.name] + uses[each.path] > 2), None)) is not None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
     if len(missing := [frame.path for frame in frames if not is_file(frame.path)]) > 1:
-        raise missing_image(missing[0], f" ({len(missing)} of {len(frames)} are missing)")
+        count = f" ({len(missing)} of {len(frames)} are missing)"
+        leave_out = f", or leave them out with `lapgs prepare {quote(str(path))} OUT`"
+        raise missing_image(missing[0], count, leave_out if len(missing) < len(frames) else "")
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
             # because renders are written under these names

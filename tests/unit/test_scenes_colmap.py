@@ -26,6 +26,8 @@ from lapgs_plugin.scenes import Scene, load_scene
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.colmap_binary import check_whole
 from lapgs_plugin.scenes.colmap_text import check_text
+from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
+from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 
 POINTS = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 3))
 COLORS = np.random.default_rng(4).integers(0, 256, (40, 3))
@@ -245,7 +247,9 @@ def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: b
     with pytest.raises(SceneError, match=r"cam 2/x\.JPG: no such image; put it there"):
         load(path)  # two files differ in case alone
     (path / "images" / names[0]).unlink()
-    with pytest.raises(SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\)"):
+    with pytest.raises(
+        SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\).*, or leave them out with"
+    ):
         load(path)
 
 
@@ -403,6 +407,18 @@ def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(SceneError, match=r"`lapgs prepare \S+/keyframes/images OUT`"):
         load(tmp_path / "keyframes" / "images")
+
+
+def test_a_model_beside_its_photos_is_to_be_prepared(tmp_path: Path) -> None:
+    """COLMAP's window exports a model to the folder that it is given."""
+    path = make_scene(tmp_path / "export")
+    (path / "sparse/0").rename(tmp_path / "model")
+    for file in (*(tmp_path / "model").iterdir(), *(path / "images").iterdir()):
+        file.rename(path / file.name)
+    with pytest.raises(SceneError, match=f"its model with `lapgs prepare {path} OUT --model {path}`"):
+        load(path)
+    prepare_scene(path, tmp_path / "out", PrepareSettings(model=path), progress=False)
+    assert len(load(tmp_path / "out").train) == 10
 
 
 def test_wrong_resolution_comes_first(tmp_path: Path) -> None:

@@ -103,7 +103,8 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
                 f"{option_name(field)}: {place} has the cameras already; leave the option out, or give a folder of "
                 "photos without a model"
             )
-    if find_model(place, (".",)) is not None:
+    transforms = find_model(place, (".",)) is None
+    if not transforms:
         model = _without_rigs(read_model(place))
         model.tear_down()  # of images without a pose, and cameras without images
         _check_lenses(model, place)
@@ -120,11 +121,12 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     there = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
     if frames and not there:
-        advice = "put them there" if place == photos else "give the folder of the photos, and the model with --model"
+        advice = "put them there" if transforms else "give the folder of the photos, and the model with --model"
         first = min(frame.path for frame in frames)
         raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
-    kinds, trained = {camera.model.name for camera in model.cameras.values()}, (photos, find_model(photos))
-    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"} and place in trained and not left_out:
+    kinds = {camera.model.name for camera in model.cameras.values()}
+    as_it_is = (transforms or place == find_model(photos)) and not left_out and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}
+    if settings.max_size is None and as_it_is:
         raise UserInputError(
             f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
             "cameras again, give a folder of photos without a model"
