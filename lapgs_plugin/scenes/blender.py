@@ -37,7 +37,8 @@ from lapgs_plugin.untrusted import read_json
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
-TEST_FILE = "transforms_test.json"
+TEST_FILES = ("transforms_test.json", "transforms_val.json")
+"""Files of views to hold out: the first that is there."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 SHORTEST_FOCAL = 1e-3
@@ -61,8 +62,8 @@ def has_transforms(path: Path) -> bool:
 def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | None = None) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
-    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file those of its
-    lists `test_filenames` and `val_filenames`, or every eighth view.
+    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, else `transforms_val.json`, and a
+    single file those of its lists `test_filenames` and `val_filenames`, or every eighth view.
     Without it, both files of a pair are trained on, as in 3DGS. If there is no PLY of points (`ply_file_path` or
     points3d.ply), 100,000 random grey points fill a cube around the point that the cameras look at.
 
@@ -97,10 +98,10 @@ def _read_pair(
 ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     train = _read_frames(path, TRAIN_FILE, train_values, images, lenses)
     test: list[Frame] = []
-    if is_file(path / TEST_FILE):
-        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images, lenses)
+    if (file := next((name for name in TEST_FILES if is_file(path / name)), None)) is not None:
+        test = _read_frames(path, file, _read_json(path / file), images, lenses)
     elif evaluate:
-        raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
+        raise SceneError(f"{path / TEST_FILES[0]}: no such file, expected the views to hold out; train without --eval")
     return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
 
 

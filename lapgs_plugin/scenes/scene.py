@@ -114,7 +114,7 @@ def load_scene(
             of the image files. "3dgs:" and the -r of a 3DGS codebase load the views as that codebase does: with its
             sizes and pixels, and with the principal point in the middle of the image.
         images: name of the image folder, such as "images_4" for smaller copies.
-        eval: hold out every eighth view in name order, or the views of `transforms_test.json`.
+        eval: hold out every eighth view in name order, or those that a transforms layout names.
         masks: as `masks.resolve_masks` takes it.
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and

@@ -496,5 +496,15 @@ def test_pair_without_its_test_file(tmp_path: Path) -> None:
     assert len(load(path).train) == 9
 
 
+def test_views_for_validation_are_held_out_if_there_are_none_for_tests(tmp_path: Path) -> None:
+    path = nerf_scene(tmp_path)
+    (path / "transforms_test.json").rename(path / "transforms_val.json")
+    assert [len(views) for views in (load(path, eval=True).train, load(path, eval=True).test)] == [9, 3]
+    assert len(load(path).train) == 12
+    values = json.loads((path / "transforms_val.json").read_text())
+    (path / "transforms_test.json").write_text(json.dumps({**values, "frames": values["frames"][:1]}))
+    assert len(load(path, eval=True).test) == 1
+
+
 def test_too_few_views(tmp_path: Path) -> None:
     refused(capture(tmp_path, 1), "1 training view, expected at least 2")
