@@ -107,7 +107,7 @@ def run(
     watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
     kind, root = _recognised(path, options.backbone, needed=not plain)
     if kind is not None and not options.off:
-        _require_levels(path, kind)
+        _require_levels(script, kind)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
