@@ -146,6 +146,8 @@ class HierarchyDriver:
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
+            elif not self._has_residuals and (self._context.hooks or self._context.images.masks):
+                dry_run.find_image()
             manifest = make_manifest(self._adapter, self._options, call, plan, bool(scene.test))
             with self._open_archive(folder, manifest) as archive:
                 self._context.watcher.run_started(archive)
