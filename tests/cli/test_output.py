@@ -76,6 +76,8 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
         ("train desk -o runs/desk", "desk: no such scene folder; "),
         ("train empty -o runs/desk", "empty: neither a COLMAP model "),
         ("train desk -o full", "full is not empty and not a run "),
+        ("train desk -o full/train.py/x", "--out full/train.py/x: full/train.py is a file; "),
+        ("run --device cpu full/train.py", "full/train.py is not the training script "),
         ("eval runs/desk", "runs/desk does not exist, "),
         ("render empty", "empty has no manifest.json, "),
         ("view empty", "empty has no manifest.json, "),
@@ -85,7 +87,8 @@ def test_messages_name_folders_as_they_were_typed(
     words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for folder in ("empty", "full/images"):
-        Path(folder).mkdir(parents=True)
+    for folder in ("empty", "full"):
+        Path(folder).mkdir()
+    Path("full/train.py").write_text("import json\n")
     with pytest.raises(UserInputError, match=f"^{message}"):
         succeeding(app, 120)(*words.split())
