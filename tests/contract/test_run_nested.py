@@ -77,7 +77,7 @@ class Seen(StageHook):
         starts: state at the first iteration of each level.
         iterations: what the checkout calls the iterations of the run.
         contexts: contexts of hooks in the second stage.
-        rendered: width, sum of the background and SH degree of every call of the rasterizer.
+        rendered: width, sum of the background and SH degree of every call of the rasterizer in an iteration or later.
     """
 
     starts: list[State] = field(default_factory=list)
@@ -104,7 +104,8 @@ def watch(adapter: Any, seen: Seen) -> None:
 
     def make_rasterizer(raster_settings: Any) -> Any:
         background = float(raster_settings.bg.sum())
-        seen.rendered.add((raster_settings.image_width, background, raster_settings.sh_degree))
+        if seen.iterations:  # one render comes before
+            seen.rendered.add((raster_settings.image_width, background, raster_settings.sh_degree))
         return rasterizer(raster_settings=raster_settings)
 
     model.update_learning_rate = update_learning_rate
