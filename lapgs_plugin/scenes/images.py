@@ -35,30 +35,44 @@ FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
 
 def find_image(path: Path) -> Path:
-    """Return an image file, or else the only file beside it whose name differs in case or Unicode form alone.
+    """Return an image file, or else the only file beside it whose name differs in case, Unicode form or format alone.
 
-    Photos are renamed so on their way between cameras and operating systems. Without such a file it is `path`.
+    Photos are renamed so on their way between cameras and operating systems; smaller copies of JPEG files are often
+    PNG files, as gsplat's. Without such a file it is `path`.
     """
     if is_file(path) or not is_folder(path.parent):
         return path
-    alike = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns).get(_plain(path.name), [])
+    files = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns)
+    alike = files.get(_plain(path.name)) or (files.get(_any_format(path), []) if _is_photo(path) else [])
     return alike[0] if len(alike) == 1 else path
 
 
 @lru_cache(maxsize=8)
 def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
-    """Return the files of a folder by `_plain` name; `changed` is the time of its last change."""
+    """Return the files of a folder by `_plain` name, and photos by `_any_format`; `changed`: when it last changed."""
     files: dict[str, list[Path]] = {}
     with suppress(PermissionError):  # opening the image says so
         for file in filter(is_file, folder.iterdir()):
             files.setdefault(_plain(file.name), []).append(file)
+            if _is_photo(file):
+                files.setdefault(_any_format(file), []).append(file)
     return files
 
 
 def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def _is_photo(file: Path) -> bool:
+    return file.suffix.lower() in SUFFIXES
+
+
+def _any_format(file: Path) -> str:
+    return f"{_plain(file.stem)}.*"
 
 
 def missing_image(path: Path, more: str = "") -> SceneError:

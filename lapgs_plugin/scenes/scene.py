@@ -129,6 +129,8 @@ def load_scene(
     path = Path(path)
     masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
+    for warning in source.warnings:
+        logger.warning(warning)
     frames = [*source.train, *source.test]
     mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]

@@ -211,6 +211,37 @@ def test_a_model_elsewhere_in_text_and_smaller_copies(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "smaller", progress=False).train[0].camera.width < 64 + 16
 
 
+def _without(model: pycolmap.Reconstruction, names: set[str], place: Path) -> None:
+    """Write the model without the images of these names."""
+    for image in [image for image in model.images.values() if image.name in names]:
+        model.deregister_frame(image.frame_id)
+    model.tear_down()
+    place.mkdir(parents=True, exist_ok=True)
+    model.write_binary(place)
+
+
+def test_the_largest_of_several_models_is_taken(tmp_path: Path) -> None:
+    scene, few = _scene(tmp_path / "scene", "sparse/1"), {"c.png", "e.png", "right/d.png"}
+    _without(_model(), few, scene / "sparse/0")
+    assert _run(scene, tmp_path / "out").registered == tuple(sorted(PHOTOS))
+    _check_images(tmp_path / "out", 0.01)
+    assert len(_run(scene, tmp_path / "named", model=scene / "sparse/0").registered) == 2
+
+
+def test_a_larger_model_that_convert_py_leaves_distorted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = tmp_path / "scene"
+    _run(_scene(tmp_path / "photos"), scene)
+    (scene / "distorted/sparse").mkdir(parents=True)
+    (tmp_path / "photos/sparse/0").rename(scene / "distorted/sparse/1")
+    (tmp_path / "photos/images").rename(scene / "input")
+    _without(pycolmap.Reconstruction(scene / "sparse/0"), {"c.png", "e.png", "right/d.png"}, scene / "sparse/0")
+    assert len(load_scene(scene, progress=False).train) == 2
+    expected = f"sparse/0 places 2 photos and {scene / 'distorted/sparse/1'} 5; make a scene of the latter with `lapgs"
+    assert expected in caplog.text
+    assert _run(scene, tmp_path / "out").registered == tuple(sorted(PHOTOS))
+    _check_images(tmp_path / "out", 0.01)
+
+
 def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
     names, model = ["left/a.jpg", "left/b 1.png", "e.png"], pycolmap.Reconstruction()
     for key in (1, 2):
@@ -293,7 +324,7 @@ def test_a_transforms_file_gives_the_images_and_poses_of_the_model(tmp_path: Pat
             {"distortion_params": [0.1]},
             r"distortion_params = \[0.1\]\) cannot be undistorted; expected numbers k1, k2, p1, p2, k3",
         ),
-        ({"camera_model": "EQUIRECTANGULAR"}, r"\(EQUIRECTANGULAR, .* cannot be undistorted"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"camera is EQUIRECTANGULAR: it sees all around"),
         ({"k1": "much"}, r"k1 = much.* cannot be undistorted"),
         ({"k1": float("nan")}, r"camera \d \(FULL_OPENCV\) has NaN or inf"),
         ({"w": 191, "h": 140}, r"a\.jpg: the image is 192x128 pixels, its camera 191x140"),
@@ -321,7 +352,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path) -> None:
     refused(UserInputError, "--model .*empty: no model of COLMAP in it", model=tmp_path / "empty")
     refused(
         SceneError,
-        "none of the 5 photos of .*sparse/0 is there, the first is c.png; give",
+        "empty/c.png: no such image, nor any other of the 5 of .*sparse/0; give the folder of the photos",
         tmp_path / "empty",
         model=scene,
     )
@@ -345,7 +376,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path) -> None:
     around = pycolmap.Camera.create_from_model_name(9, "EQUIRECTANGULAR", 1.0, 192, 128)
     model.cameras[1].model, model.cameras[1].params = around.model, around.params
     model.write_binary(scene / "sparse" / "0")
-    refused(SceneError, r"camera 1 \(EQUIRECTANGULAR\) sees all around")
+    refused(SceneError, r"camera 1 \(EQUIRECTANGULAR\): it sees all around")
 
 
 def test_exr_keeps_its_range(tmp_path: Path) -> None:
@@ -368,6 +399,8 @@ def test_cameras_without_distortion_are_refused_and_made_smaller(tmp_path: Path)
         _run(tmp_path / "done", tmp_path / "out")
     _run(tmp_path / "done", tmp_path / "out", max_size=100)
     _check_images(tmp_path / "out", 0.02)
+    (tmp_path / "done/images/c.png").unlink()
+    assert _run(tmp_path / "done", tmp_path / "fewer").left_out == ("c.png",)
     assert max(view.camera.width for view in load_scene(tmp_path / "out", progress=False).train) == 100
 
 

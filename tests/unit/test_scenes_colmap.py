@@ -249,6 +249,21 @@ def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: b
         load(path)
 
 
+def test_smaller_copies_may_have_another_format(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(("a.1.JPG", "a.2.JPG", "b/c.jpg")))
+    copies = {"a.1.png": (24, 16), "a.2.PNG": (24, 16), "b/c.tif": (24, 16)}
+    write_images(path / "images_4_png", copies)
+    (path / "images_4_png" / "a.1.txt").write_text("no photo")
+    scene = load(path, images="images_4_png")
+    assert [view.name for view in scene.train] == ["a.1.JPG", "a.2.JPG", "b/c.jpg"]
+    for view, name in zip(scene.train, copies, strict=True):
+        assert view.camera.size == (24, 16)
+        torch.testing.assert_close(view.image, torch.full((3, 16, 24), sum(name.encode()) % 256 / 255.0))
+    (path / "images_4_png" / "a.1.bmp").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"images_4_png/a\.1\.JPG: no such image"):
+        load(path, images="images_4_png")
+
+
 def test_two_names_of_one_photo_are_refused(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(("a.png", "A.png", "c.png")))
     (path / "images" / "A.png").unlink()
@@ -330,6 +345,13 @@ def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: st
     with pytest.raises(SceneError, match=message + ".*`lapgs prepare") as caught:
         load(path)
     assert_one_line(caught)
+
+
+def test_photos_that_see_all_around_cannot_be_undistorted(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(cameras={1: "EQUIRECTANGULAR 96 64 96 64"}))
+    with pytest.raises(SceneError, match="sees all around, which no pinhole image shows; cut") as caught:
+        load(path)
+    assert "lapgs prepare" not in str(caught.value)
 
 
 def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:
@@ -427,10 +449,12 @@ def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
     assert_one_line(caught)
 
 
-def test_model_without_points(tmp_path: Path) -> None:
-    path = make_scene(tmp_path, Model(points=np.empty((0, 3))))
-    with pytest.raises(SceneError, match="the model has no 3D points"):
-        load(path)
+def test_a_model_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = load(make_scene(tmp_path, Model(points=np.empty((0, 3)))))
+    assert "the model has no 3D points; training starts from random ones" in caplog.text
+    middle, reach = scene.points.mean(dim=0), (scene.points.amax(dim=0) - scene.points.amin(dim=0)).min() / 2
+    assert middle.norm() < 0.2  # the cameras look past the origin by at most 0.19; seen 0.13
+    assert scene.train[0].camera.position.norm() / 2 < reach
 
 
 def test_points_with_nan(tmp_path: Path) -> None:
@@ -444,7 +468,11 @@ def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
     with pytest.raises(SceneError, match="images_4: no such folder of images; choose images with --images"):
         load(path, images="images_4")
-    shutil.rmtree(path / "images")
+    (path / "images").rename(path / "Fotos März")
+    with pytest.raises(SceneError, match="images: no such folder of images; choose Fotos März with --images"):
+        load(path)
+    assert len(load(path, images="Fotos März").train) == len(Model().names)
+    shutil.rmtree(path / "Fotos März")
     with pytest.raises(SceneError, match="images: no such folder of images; put the photos"):
         load(path)
 

@@ -11,17 +11,17 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 
-from lapgs_plugin.errors import SceneError, UserInputError, printable
+from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
 from lapgs_plugin.scenes.blender import Lenses, has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_model, source_of
-from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, largest_model, read_model, source_of
+from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.scene import check_shape, check_source
-from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource
+from lapgs_plugin.scenes.source import ALL_AROUND, ALL_AROUND_HINT, PINHOLE_MODELS, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
 """Where the photos of these models are."""
@@ -69,16 +69,20 @@ class Given:
 def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
     """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
 
+    Of several models the largest is taken.
+
     Raises:
         UserInputError: --model names none.
     """
     if settings.model is None:
-        return find_model(photos, MODEL_PLACES) or (photos if has_transforms(photos) else None)
+        if (found := find_model(photos, MODEL_PLACES)) is not None:
+            return largest_model(photos, found)
+        return photos if has_transforms(photos) else None
     if (found := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
         raise UserInputError(
             f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and points3D"
         )
-    return found
+    return largest_model(settings.model, found)
 
 
 def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
@@ -104,7 +108,7 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         model.tear_down()  # of images without a pose, and cameras without images
         _check_lenses(model, place)
         source = source_of(model, place, photos)
-        folder = max((photos / name for name in FOLDERS), key=lambda folder: _present(source, folder))
+        folder = max((photos / name for name in FOLDERS), key=lambda folder: _fit(source, folder))
         frames = [replace(frame, path=find_image(folder / frame.name)) for frame in source.train]
     else:
         lenses: Lenses = {}
@@ -113,21 +117,22 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         frames = [replace(frame, name=frame.name.removeprefix(top)) for frame in source.train]
         model = _model_of(replace(source, train=tuple(frames)), lenses)
         _check_lenses(model, place)
-    kinds = {camera.model.name for camera in model.cameras.values()}
-    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}:
+    there = tuple(frame for frame in frames if is_file(frame.path))
+    left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
+    if frames and not there:
+        advice = "put them there" if place == photos else "give the folder of the photos, and the model with --model"
+        first = min(frame.path for frame in frames)
+        raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
+    kinds, trained = {camera.model.name for camera in model.cameras.values()}, (photos, find_model(photos))
+    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"} and place in trained and not left_out:
         raise UserInputError(
             f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
             "cameras again, give a folder of photos without a model"
         )
-    there = tuple(frame for frame in frames if is_file(frame.path))
-    left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
-    if frames and not there:
-        raise SceneError(
-            f"{folder}: none of the {len(frames)} photos of {place} is there, the first is {printable(left_out[0])}; "
-            "give the folder of the photos, and the model with --model"
-        )
     check_source(photos, replace(source, train=there))
     check_targets(photos, [(frame.name, frame.name) for frame in there])
+    for warning in source.warnings:
+        logger.warning(warning)
     if left_out:
         logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
     frame_of = {image.name: image.frame_id for image in model.images.values()}
@@ -141,8 +146,13 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     return Given(model, there, Photos(folder, files), tuple(left_out), replace(settings, masks=masks, model=place))
 
 
-def _present(source: SceneSource, folder: Path) -> int:
-    return sum(is_file(find_image(folder / frame.name)) for frame in source.train)
+def _fit(source: SceneSource, folder: Path) -> tuple[int, bool]:
+    """Return how many photos of a model are in a folder, and whether the first of them has its camera's size.
+
+    3DGS's convert.py leaves photos in `input` and undistorted ones, which may have the same shape, in `images`.
+    """
+    there = [(file, frame) for frame in source.train if is_file(file := find_image(folder / frame.name))]
+    return len(there), any(image_size(file) == frame.camera.size for file, frame in there[:1])
 
 
 def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -159,8 +169,8 @@ def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _check_lenses(model: pycolmap.Reconstruction, place: Path) -> None:
     for key, camera in model.cameras.items():
         who = f"{place}: camera {key} ({camera.model.name})"
-        if camera.model.name == "EQUIRECTANGULAR":
-            raise SceneError(f"{who} sees all around, which no pinhole image shows; cut its photos into several first")
+        if camera.model.name == ALL_AROUND:
+            raise SceneError(f"{who}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
 
@@ -187,6 +197,8 @@ def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> t
     """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
     if kind in PINHOLE_MODELS and not distortion:
         return "PINHOLE", []
+    if kind == ALL_AROUND:
+        raise SceneError(f"{frame.path}: its camera is {kind}: {ALL_AROUND_HINT}")
     model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
     values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
     if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):
