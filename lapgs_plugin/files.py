@@ -27,6 +27,9 @@ PREVIEW = "preview.jpg"
 LOCK, LOCK_POLL_SECONDS = ".lock", 0.05
 """File that `FolderLock` locks; seconds between two attempts to lock something."""
 
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""First bytes of the text in place of a file that Git LFS keeps elsewhere."""
+
 TEMPORARY_PATTERN = ".*.tmp"
 """Glob of the temporary files of `atomic_write`, which a killed process may leave."""
 
@@ -147,6 +150,13 @@ def is_file(path: Path) -> bool:
 def is_folder(path: Path) -> bool:
     """Return whether a folder exists; False also for names that the file system does not allow."""
     return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises for these names
+
+
+def refuse_lfs_pointer(file: Path, kind: type[LapgsError]) -> None:
+    """Raise an error of this kind if a file is the short text that Git leaves in its place where Git LFS is missing."""
+    with file.open("rb") as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise kind(f"{file}: a pointer of Git LFS, not the file itself; fetch it with `git lfs pull`")
 
 
 def require_manifest(folder: Path) -> None:

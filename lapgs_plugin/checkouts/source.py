@@ -98,17 +98,17 @@ class CheckoutSource:
             UserInputError: it is not Python, or not the training script of a 3DGS checkout; the line says what is
                 missing.
         """
-        script = script.absolute()
+        given, script = script, script.absolute()
         known, changed = _READ.get(script, (None, {}))
         if known is not None and _times(changed) == changed:
             return known
-        source = cls._read(script)
+        source = cls._read(script, given)
         files = {script, *source.modules.values()}
         _READ[script] = source, _times({*files, *(file.parent for file in files)})
         return source
 
     @classmethod
-    def _read(cls, script: Path) -> CheckoutSource:
+    def _read(cls, script: Path, given: Path) -> CheckoutSource:
         tree = parsed(script)
         near = ""
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
@@ -119,13 +119,13 @@ class CheckoutSource:
                 break
         else:
             raise UserInputError(
-                f"{script} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
+                f"{given} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
                 f"with {' and '.join(MODEL_ROLES)}; {OTHERWISE}"
             )
         training = _find_training(tree)
         if training is None:
             raise UserInputError(
-                f"{script} has no function that its main block calls and that calls backward(), expected a function "
+                f"{given} has no function that its main block calls and that calls backward(), expected a function "
                 f"like training(dataset, opt, pipe, ...); {OTHERWISE}"
             )
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))

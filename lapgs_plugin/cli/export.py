@@ -122,14 +122,14 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
     if not settings.html:
         _make(folder)
         path = folder / f"{MERGED}.{settings.file_format}"
-        _write_field(field, path, f"one field fitted to the images of {archive.path().name}")
+        _write_field(field, path, f"one field fitted to the images of {archive.name}")
         _print_written(path, field)
         return
     cameras = list(run_cameras(archive, settings.scene)[0].values())
     _make(folder)
     # Pages of several levels can lie beside each other.
     path = folder / (PAGE if settings.level is None else f"{_level_name(archive, settings.level)}.html")
-    write_splat_page(field, path, archive.path().name, cameras, archive.manifest.scene.background)
+    write_splat_page(field, path, archive.name, cameras, archive.manifest.scene.background)
     _print_written(path, field, ", opens in a browser without a network")
 
 
@@ -189,7 +189,7 @@ def _level_name(archive: RunArchive, level: int) -> str:
 
 def _note(archive: RunArchive, level: int) -> str:
     """Return a comment for the file's header that says what the level is."""
-    name, levels = archive.path().name, archive.manifest.levels
+    name, levels = archive.name, archive.manifest.levels
     if level == levels - 1:
         return f"base of {name}, a hierarchy of {levels} levels" if levels > 1 else f"field of {name}"
     if not archive.manifest.record(level).signed:

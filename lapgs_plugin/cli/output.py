@@ -59,12 +59,12 @@ def require_place(folder: Path) -> None:
     Raises:
         UserInputError: it is a file or below one, or it is not writable.
     """
-    existing = str(folder.absolute())
+    existing = str(folder)
     # Not Path.exists, which raises where a name is too long for the file system.
     while not os.path.lexists(existing):
         if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
             raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
-        existing = os.path.dirname(existing)  # noqa: PTH120
+        existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
     if not is_folder(Path(existing)):
         raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):

@@ -90,7 +90,7 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     from lapgs_plugin.evaluation.lpips import missing_lines
     from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
-    names = [escape(each.archive.path().name) for each in runs]
+    names = [escape(each.archive.name) for each in runs]
     table = make_table("", *names, *(["change"] if len(runs) > 1 else []))
     for row in comparison_rows([each.metrics for each in runs]):
         cells = ["\n".join([cell.text, *(f"[dim]{part}[/dim]" for part in cell.parts)]) for cell in row.cells]

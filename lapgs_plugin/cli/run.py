@@ -105,9 +105,9 @@ def run(
         require_cuda(device)
     path, words = require_script(script), arguments or []
     watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
-    kind, root = _recognised(path, options.backbone, needed=not plain)
+    kind, root = _recognised(script, options.backbone, needed=not plain)
     if kind is not None and not options.off:
-        _require_levels(path, kind)
+        _require_levels(script, kind)
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return

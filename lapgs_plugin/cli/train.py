@@ -118,11 +118,11 @@ def train(
 
 
 def _reference(scene: Path, photos: SceneOptions) -> SceneReference:
-    """Return the scene, and how it is read, for the manifest; the scene is not read yet."""
+    """Return the scene's folder as it was typed, and how it is read; the scene is not read yet."""
     from lapgs_plugin.runs.manifest import SceneReference
 
     return SceneReference(
-        *(str(scene.absolute()), photos.resolution, photos.eval, photos.background_color),
+        *(str(scene), photos.resolution, photos.eval, photos.background_color),
         images=photos.images,
         kind="",
         masks=photos.masks,
@@ -147,7 +147,7 @@ def _finish(out: Path, scene: Path) -> None:
 
     from lapgs_plugin.viewer.preview import save_run_preview
 
-    save_run_preview(out.absolute(), moved_to=scene)
+    save_run_preview(out, moved_to=scene)
     name, word = escape(str(out)), escape(shlex.quote(str(out)))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
@@ -213,7 +213,7 @@ def _resume(
                 raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         with errors_about(archive.path(MANIFEST)):
-            loaded = load_reference(replace(manifest.scene, path=str(scene.absolute())))
+            loaded = load_reference(replace(manifest.scene, path=str(scene)))
         require_same_scene(archive, scene, loaded.smallest_size)
         with errors_about(archive.path(MANIFEST)):
             make_plan(loaded.smallest_size, settings, len(loaded.train))
@@ -296,7 +296,8 @@ def _create(
     if choose_iterations:
         settings = _for_photos(len(loaded.train), settings)
     require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
-    manifest = Manifest(scene=replace(reference, kind=loaded.kind), rasterizer=rasterizer, **settings.for_manifest())
+    found = replace(reference, path=str(Path(reference.path).absolute()), kind=loaded.kind)
+    manifest = Manifest(scene=found, rasterizer=rasterizer, **settings.for_manifest())
     return RunArchive.create(out, manifest, overwrite), loaded, settings
 
 

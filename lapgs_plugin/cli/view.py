@@ -52,11 +52,11 @@ def view(
     """
     require_extra("viser", "viewer", "lapgs view")
     for folder in filter(None, (run, baseline)):
-        require_manifest(folder.absolute())
+        require_manifest(folder)
     from lapgs_plugin.viewer.preview import read_preview
 
     # The browser loads the page while this process imports torch and the rasterizer.
-    with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run.absolute())) as page:
+    with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run)) as page:
         from lapgs_plugin.jit.threads import one_pool
 
         show_log()

@@ -196,7 +196,7 @@ def evaluate_stability(
         "size": [cameras[0].width, cameras[0].height],
         "frames": len(cameras),
         "compared": compared,
-        "baseline": None if single is None else str(single.path()),
+        "baseline": None if single is None else str(single.path().absolute()),
         "flicker": {name: {"mean": each.mean, "psnr": each.psnr} for name, each in flicker.items()},
     }
     archive.write_stability(figures)

@@ -62,7 +62,7 @@ class MeasuredRun:
 
     @property
     def name(self) -> str:
-        return self.archive.path().name
+        return self.archive.name
 
 
 @dataclass(frozen=True)

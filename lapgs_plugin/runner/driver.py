@@ -126,7 +126,7 @@ class HierarchyDriver:
         given = Path(call.dataset.model_path or _default_folder())
         folder, source = given.absolute(), Path(call.dataset.source_path)
         if not self._resume:
-            RunArchive.require_room(folder, self._overwrite, self._since)
+            RunArchive.require_room(given, self._overwrite, self._since)
         if not source.exists():
             raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
@@ -146,6 +146,8 @@ class HierarchyDriver:
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
+            elif not self._has_residuals and (self._context.hooks or self._context.images.masks):
+                dry_run.find_image()
             manifest = make_manifest(self._adapter, self._options, call, plan, bool(scene.test))
             with self._open_archive(folder, manifest) as archive:
                 self._context.watcher.run_started(archive)
@@ -158,7 +160,7 @@ class HierarchyDriver:
                         SingleCall(self._context, run, plan).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
-                    logger.info("stopped; finished levels in %s: %s; --resume continues after them", folder, kept)
+                    logger.info("stopped; finished levels in %s: %s; --resume continues after them", given, kept)
                     raise
                 finally:
                     # A run that is continued makes its images again.

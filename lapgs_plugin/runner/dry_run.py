@@ -127,8 +127,7 @@ class DryRun:
             ),
             self._values_beside_explained(),
         ):
-            gaussians = self._adapter.new_model(self._call)
-            gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+            gaussians = self._new_model()
             self._require_parameters(gaussians)
             self._require_settable(gaussians)
             self._require_three_axes(gaussians)
@@ -137,6 +136,23 @@ class DryRun:
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
         return path
+
+    def find_image(self) -> None:
+        """Render a view, by which the wrapper of the rasterizer knows which of a renderer's images is the model's.
+
+        Hooks and masks would get a map that is rasterized before the image, in the first iteration.
+        """
+        with _undisturbed(self._context.device):
+            try:
+                self._render(self._view(self._scene.train[0]), self._new_model())
+            except Exception as error:  # the loop may do what is missing here
+                logger.debug("no view could be rendered before the first iteration: %s", typed_line(error))
+
+    def _new_model(self) -> Any:
+        """Return the checkout's model of some of the scene's points."""
+        gaussians = self._adapter.new_model(self._call)
+        gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
+        return gaussians
 
     def _iterate(self, stage: _DryStage, works: str) -> None:
         """Run the first iteration of the script's loop."""

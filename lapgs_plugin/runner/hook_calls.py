@@ -55,6 +55,7 @@ class HookCaller:
     def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
         """Call `on_stage_start`."""
         self._stage, self._rendering, self._context = stage, rendering, None
+        self._iteration = 1  # loops without a clock begin their first one with its step, after its render
         self._hooks.on_stage_start(stage)
 
     def stage_ends(self, stage: Stage) -> None:

@@ -70,7 +70,7 @@ class RunArchive(RunFiles):
                 process is writing to it, it cannot be written, or the manifest has a value that cannot be read again.
         """
         assert not manifest.records, "a new run has no finished level"
-        folder = Path(path).absolute()
+        folder = Path(path)
         Manifest.from_json(asdict(manifest))  # refuse now what could not be read after training
         require_room(folder, overwrite, since)
         with one_line_errors(folder):
@@ -102,7 +102,7 @@ class RunArchive(RunFiles):
             RunFolderError: there is no run, another version wrote it, a level's PLY is missing or cut short, or, with
                 `resume`, another process is writing to it.
         """
-        folder = Path(path).absolute()
+        folder = Path(path)
         manifest = read_manifest(folder)
         lock = FolderLock.acquire(folder) if resume else None
         try:

@@ -56,7 +56,7 @@ def require_room(path: Path | str, overwrite: bool = False, since: int | None = 
     Raises:
         RunFolderError: as `RunArchive.create`, except for problems that only writing shows.
     """
-    folder = Path(path).absolute()
+    folder = Path(path)
     with one_line_errors(folder, "read"):
         if folder.exists() and not folder.is_dir():
             raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")

@@ -51,8 +51,13 @@ class RunFiles:
         """The finished levels, coarsest first."""
         return tuple(record.level for record in self._manifest.records)
 
+    @property
+    def name(self) -> str:
+        """The name of the run folder."""
+        return self._folder.absolute().name
+
     def path(self, *parts: str) -> Path:
-        """Return the path of the run folder, or of something in it."""
+        """Return the path of the run folder as it was given, or of something in it."""
         return self._folder.joinpath(*parts)
 
     def append_history(self, entry: dict[str, Any]) -> None:

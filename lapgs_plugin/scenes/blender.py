@@ -8,7 +8,6 @@ frame (https://docs.nerf.studio/quickstart/data_conventions.html).
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from pathlib import Path, PurePosixPath
@@ -23,6 +22,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.images import find_image, image_size
+from lapgs_plugin.scenes.random_points import CAPTURE_RADIUS, OBJECT_RADIUS, random_points
 from lapgs_plugin.scenes.source import (
     LARGEST,
     PINHOLE_MODELS,
@@ -37,7 +37,8 @@ from lapgs_plugin.untrusted import read_json
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
-TEST_FILE = "transforms_test.json"
+TEST_FILES = ("transforms_test.json", "transforms_val.json")
+"""Files of views to hold out: the first that is there."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 SHORTEST_FOCAL = 1e-3
@@ -47,15 +48,6 @@ LAST_ROW_ERROR = 1e-4
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
-
-RANDOM_POINTS = 100_000
-OBJECT_RADIUS = 1.3 / 4.03
-"""Half the side of the cube of random points for a Blender scene, in mean distances of the cameras from its centre.
-3DGS uses 1.3 for NeRF's objects, whose cameras are 4.03 away."""
-CAPTURE_RADIUS = 1.0
-"""The same for a single transforms file, whose photos also show the surroundings."""
-
-logger = logging.getLogger(__name__)
 
 Values = dict[str, Any]
 Lenses = dict[Path, tuple[str, Values]]
@@ -70,8 +62,8 @@ def has_transforms(path: Path) -> bool:
 def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | None = None) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
-    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, and a single file those of its
-    lists `test_filenames` and `val_filenames`, or every eighth view.
+    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, else `transforms_val.json`, and a
+    single file those of its lists `test_filenames` and `val_filenames`, or every eighth view.
     Without it, both files of a pair are trained on, as in 3DGS. If there is no PLY of points (`ply_file_path` or
     points3d.ply), 100,000 random grey points fill a cube around the point that the cameras look at.
 
@@ -93,8 +85,12 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
         frames = _read_frames(path, SINGLE_FILE, values, images, lenses)
         train, test = hold_out(frames, evaluate, _chosen_for_tests(frames, values))
         radius = CAPTURE_RADIUS
-    points, colors = _read_points(path, file, values) or _random_points([*train, *test], radius)
-    return SceneSource("transforms", train, test, points, colors)
+    given = _read_points(path, file, values)
+    warnings: tuple[str, ...] = ()
+    if given is None and (named := values.get("ply_file_path")):  # nerfstudio, too, takes random points then
+        warnings = (f"{path / file} names {named}: no such file; training starts from random points",)
+    points, colors = given or random_points([*train, *test], radius)
+    return SceneSource("transforms", train, test, points, colors, warnings)
 
 
 def _read_pair(
@@ -102,10 +98,10 @@ def _read_pair(
 ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     train = _read_frames(path, TRAIN_FILE, train_values, images, lenses)
     test: list[Frame] = []
-    if is_file(path / TEST_FILE):
-        test = _read_frames(path, TEST_FILE, _read_json(path / TEST_FILE), images, lenses)
+    if (file := next((name for name in TEST_FILES if is_file(path / name)), None)) is not None:
+        test = _read_frames(path, file, _read_json(path / file), images, lenses)
     elif evaluate:
-        raise SceneError(f"{path / TEST_FILE}: no such file, expected the views to hold out; train without --eval")
+        raise SceneError(f"{path / TEST_FILES[0]}: no such file, expected the views to hold out; train without --eval")
     return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
 
 
@@ -172,7 +168,7 @@ def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Len
             lenses[image] = lens
         elif lens[0] not in PINHOLE_MODELS or lens[1]:
             terms = "".join(f", {key} = {value}" for key, value in lens[1].items())
-            raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path)}")
+            raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path, lens[0])}")
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
         camera = read_camera(posed, where)
@@ -275,17 +271,14 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
 
 
 def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
+    """Return positions and colours (n, 3) of the scene's PLY; None if it has none, or one that is not there."""
     named = values.get("ply_file_path")
     if named is not None and not isinstance(named, str):
         raise SceneError(
             f"{path / transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
         )
     file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
-    if file is None:
-        return None
-    if not is_file(file):  # nerfstudio, too, trains from random points then
-        logger.warning("%s names %s: no such file; random points are used instead of it", path / transforms, file)
+    if file is None or not is_file(file):
         return None
     subject = f"{path / transforms} names {file}" if named else f"{file}"
     try:
@@ -304,19 +297,3 @@ def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[n
         return points, np.full_like(points, 0.5)
     colors = np.stack([vertices[channel] for channel in channels], axis=1)
     return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
-
-
-def _random_points(frames: list[Frame], radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return grey points in a cube around the point that the cameras look at; see `OBJECT_RADIUS` for `radius`."""
-    poses = np.stack([frame.camera.world_to_camera.numpy() for frame in frames])  # (v, 4, 4)
-    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])  # (v, 3)
-    axes = poses[:, 2, :3]  # (v, 3) viewing directions in world coordinates
-    # The least-squares point closest to all optical axes, relative to the mean centre: parallel axes, which do not
-    # determine its depth, put it among the cameras.
-    projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)  # (v, 3, 3)
-    middle = centers.mean(axis=0)
-    offsets = np.einsum("vij,vj->i", projectors, centers - middle)
-    focus = middle + np.linalg.lstsq(projectors.sum(axis=0), offsets, rcond=1e-6)[0]
-    half_side = radius * np.linalg.norm(centers - focus, axis=1).mean()
-    cube = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_POINTS, 3))
-    return focus + half_side * cube, np.full((RANDOM_POINTS, 3), 0.5)

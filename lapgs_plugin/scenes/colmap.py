@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import pycolmap
@@ -20,6 +21,7 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
 from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.random_points import random_points
 from lapgs_plugin.scenes.source import (
     PINHOLE_MODELS,
     Frame,
@@ -77,20 +79,30 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
     reconstruction = read_model(model)
-    folder = path / images
-    if not is_folder(folder):
-        others = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
-        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
-        raise SceneError(f"{folder}: no such folder of images; {hint}")
     for key in sorted({image.camera_id for image in reconstruction.images.values() if image.has_pose}):
         _refuse_distortion(reconstruction.cameras[key], model, path)
+    folder = path / images
     source = source_of(reconstruction, model, folder)
+    if not is_folder(folder):
+        inside = [*sorted(each.name for each in path.iterdir() if each.is_dir()), "."]
+        first = [frame.name for frame in source.train[:1]]
+        others = [each for each in inside for name in first if is_file(find_image(path / each / name))]
+        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
+        raise SceneError(f"{folder}: no such folder of images; {hint}")
     train, test = hold_out(source.train, evaluate)
-    return replace(source, train=train, test=test)
+    warnings = source.warnings
+    if (larger := largest_model(path, model)) != model:
+        warnings += (
+            f"{model} places {count_images(model)} photos and {larger} {count_images(larger)}; make a scene of the "
+            f"latter with `lapgs prepare {quote(str(path))} OUT`",
+        )
+    return replace(source, train=train, test=test, warnings=warnings)
 
 
 def source_of(reconstruction: pycolmap.Reconstruction, model: Path, folder: Path) -> SceneSource:
     """Return frames and points of a model, with pinhole cameras even where the model's are distorted.
+
+    A model without points gets random ones.
 
     Args:
         reconstruction: the model, whose cameras are perspective or fisheye.
@@ -98,21 +110,18 @@ def source_of(reconstruction: pycolmap.Reconstruction, model: Path, folder: Path
         folder: of the images, of which some may be missing.
 
     Raises:
-        SceneError: it has no points, or a name, a pose or a camera cannot be used.
+        SceneError: a name, a pose or a camera cannot be used.
     """
     posed = [image for image in reconstruction.images.values() if image.has_pose]
     cameras = {key: _intrinsics(reconstruction.cameras[key]) for key in {image.camera_id for image in posed}}
     frames = [_frame(model, folder, cameras[image.camera_id], image) for image in posed]
-    points = [(point.xyz, point.color) for point in reconstruction.points3D.values()]
-    if not points:
-        raise SceneError(f"{model}: the model has no 3D points, expected the sparse points of a reconstruction")
-    return SceneSource(
-        "colmap",
-        in_name_order(frames),
-        (),
-        points=np.array([xyz for xyz, _ in points], np.float64),
-        colors=np.array([rgb for _, rgb in points], np.float64) / 255.0,
-    )
+    points = np.array([point.xyz for point in reconstruction.points3D.values()], np.float64)
+    colors = np.array([point.color for point in reconstruction.points3D.values()], np.float64) / 255.0
+    warnings: tuple[str, ...] = ()
+    if not len(points) and frames:  # known cameras, of a phone or a renderer
+        warnings = (f"{model}: the model has no 3D points; training starts from random ones",)
+        points, colors = random_points(frames)
+    return SceneSource("colmap", in_name_order(frames), (), points, colors, warnings)
 
 
 def read_model(model: Path) -> pycolmap.Reconstruction:
@@ -151,7 +160,8 @@ def _refuse_distortion(camera: pycolmap.Camera, model: Path, scene: Path) -> Non
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     if kind not in PINHOLE_MODELS or any(distortion):
         values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
-        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {undistort_hint(scene)}")
+        hint = undistort_hint(scene, kind)
+        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {hint}")
 
 
 def _intrinsics(camera: pycolmap.Camera) -> Camera:

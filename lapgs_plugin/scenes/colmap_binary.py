@@ -14,6 +14,7 @@ from pathlib import Path
 import pycolmap
 
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.files import refuse_lfs_pointer
 
 COUNT = struct.Struct("<Q")
 SMALL_COUNT = struct.Struct("<I")
@@ -25,7 +26,7 @@ def check_whole(folder: Path) -> None:
     """Check the binary files of the model in `folder`.
 
     Raises:
-        SceneError: a file ends before its last record.
+        SceneError: a file ends before its last record, or is a pointer of Git LFS.
     """
     for name in RECORD_ENDS:
         file = folder / f"{name}.bin"
@@ -37,6 +38,7 @@ def check_whole(folder: Path) -> None:
                 pass
         # The data ends inside a record, a count or a name, or a camera model does not exist.
         except (struct.error, ValueError) as error:
+            refuse_lfs_pointer(file, SceneError)
             raise SceneError(
                 f"{file}: the file is damaged or cut short at {len(data)} bytes, expected all records that its header "
                 "counts; copy it again"

@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, joined
-from lapgs_plugin.files import is_file, is_folder, whole_file
+from lapgs_plugin.files import is_file, is_folder, refuse_lfs_pointer, whole_file
 from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
 
 JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
@@ -35,25 +35,31 @@ FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
 
 def find_image(path: Path) -> Path:
-    """Return an image file, or else the only file beside it whose name differs in case or Unicode form alone.
+    """Return an image file, or else the only file beside it whose name differs in case, Unicode form or format alone.
 
-    Photos are renamed so on their way between cameras and operating systems. Without such a file it is `path`.
+    Photos are renamed so on their way between cameras and operating systems; smaller copies of JPEG files are often
+    PNG files, as gsplat's. Without such a file it is `path`.
     """
     if is_file(path) or not is_folder(path.parent):
         return path
-    alike = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns).get(_plain(path.name), [])
+    files = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns)
+    alike = files.get(_plain(path.name)) or (files.get(_any_format(path), []) if _is_photo(path) else [])
     return alike[0] if len(alike) == 1 else path
 
 
 @lru_cache(maxsize=8)
 def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
-    """Return the files of a folder by `_plain` name; `changed` is the time of its last change."""
+    """Return the files of a folder by `_plain` name, and photos by `_any_format`; `changed`: when it last changed."""
     files: dict[str, list[Path]] = {}
     with suppress(PermissionError):  # opening the image says so
         for file in filter(is_file, folder.iterdir()):
             files.setdefault(_plain(file.name), []).append(file)
+            if _is_photo(file):
+                files.setdefault(_any_format(file), []).append(file)
     return files
 
 
@@ -61,9 +67,17 @@ def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def missing_image(path: Path, more: str = "") -> SceneError:
-    """Return the error for an image that is not there; `more` follows."""
-    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images")
+def _is_photo(file: Path) -> bool:
+    return file.suffix.lower() in SUFFIXES
+
+
+def _any_format(file: Path) -> str:
+    return f"{_plain(file.stem)}.*"
+
+
+def missing_image(path: Path, more: str = "", advice: str = "") -> SceneError:
+    """Return the error for an image that is not there; `more` follows, and `advice` at the end."""
+    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images{advice}")
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -319,6 +333,7 @@ def _open(path: Path) -> oiio.ImageInput:
     source = oiio.ImageInput.open(str(path), options)
     if source is None:
         reason = joined(oiio.geterror())
+        refuse_lfs_pointer(path, SceneError)
         raise SceneError(f"{path}: not a readable image ({reason}), expected JPEG, PNG, TIFF or EXR; replace the file")
     return source
 

@@ -12,12 +12,11 @@ from torch import Tensor
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.scenes.blender import mask_folder
-from lapgs_plugin.scenes.images import has_alpha, image_size, read_image, same_shape
+from lapgs_plugin.scenes.images import SUFFIXES, has_alpha, image_size, read_image, same_shape
 
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
 AUTO, NONE, ALPHA = "auto", "none", "alpha"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 HEIC = (".heic", ".heif", ".hif")
 """Photos of phones that neither COLMAP nor OpenImageIO reads."""
 

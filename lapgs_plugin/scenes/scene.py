@@ -18,7 +18,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, count_images, find_model, largest_model, read_colmap
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, missing_image, read_as_3dgs, read_image, same_shape
 from lapgs_plugin.scenes.masks import (
     ALPHA,
@@ -114,7 +114,7 @@ def load_scene(
             of the image files. "3dgs:" and the -r of a 3DGS codebase load the views as that codebase does: with its
             sizes and pixels, and with the principal point in the middle of the image.
         images: name of the image folder, such as "images_4" for smaller copies.
-        eval: hold out every eighth view in name order, or the views of `transforms_test.json`.
+        eval: hold out every eighth view in name order, or those that a transforms layout names.
         masks: as `masks.resolve_masks` takes it.
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
@@ -129,7 +129,8 @@ def load_scene(
     path = Path(path)
     masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
-    _warn_of_a_larger_model(path)
+    for warning in source.warnings:
+        logger.warning(warning)
     frames = [*source.train, *source.test]
     mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]
@@ -232,15 +233,6 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     return source
 
 
-def _warn_of_a_larger_model(path: Path) -> None:
-    model = find_model(path)
-    if model is not None and (larger := largest_model(path, model)) != model:
-        logger.warning(
-            "%s places %d photos and %s %d; make a scene of the latter with `lapgs prepare %s OUT`",
-            *(model, count_images(model), larger, count_images(larger), quote(str(path))),
-        )
-
-
 def _what_to_give(path: Path) -> str:
     """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
     if find_model(path, MODEL_PLACES) is not None:
@@ -249,6 +241,9 @@ def _what_to_give(path: Path) -> str:
     folders = [*inside, *path.parents[:3]]
     if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
         return f"give {scene}, which has one"
+    if find_model(path, (".",)) is not None:
+        folder = quote(str(path))
+        return f"make a scene of its photos and its model with `lapgs prepare {folder} OUT --model {folder}`"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
     photos = next(
         (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
@@ -274,7 +269,9 @@ def check_source(path: Path, source: SceneSource) -> None:
     if (double := next((each.name for each in frames if uses[each.name] + uses[each.path] > 2), None)) is not None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
     if len(missing := [frame.path for frame in frames if not is_file(frame.path)]) > 1:
-        raise missing_image(missing[0], f" ({len(missing)} of {len(frames)} are missing)")
+        count = f" ({len(missing)} of {len(frames)} are missing)"
+        leave_out = f", or leave them out with `lapgs prepare {quote(str(path))} OUT`"
+        raise missing_image(missing[0], count, leave_out if len(missing) < len(frames) else "")
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
             # because renders are written under these names

@@ -19,6 +19,9 @@ HOLD_OUT_EVERY = 8
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
 
+ALL_AROUND = "EQUIRECTANGULAR"
+ALL_AROUND_HINT = "it sees all around, which no pinhole image shows; cut its photos into several first"
+
 LARGEST = 1e12
 """Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
 
@@ -53,6 +56,7 @@ class SceneSource:
         train, test: in name order.
         points: (n, 3) float64 positions in world units.
         colors: (n, 3) float64 RGB in [0, 1].
+        warnings: lines for whoever trains on the scene.
     """
 
     kind: str
@@ -60,10 +64,13 @@ class SceneSource:
     test: tuple[Frame, ...]
     points: NDArray[np.float64]  # (n, 3)
     colors: NDArray[np.float64]  # (n, 3)
+    warnings: tuple[str, ...] = ()
 
 
-def undistort_hint(scene: Path) -> str:
-    """Return what to do about distorted cameras of a scene."""
+def undistort_hint(scene: Path, model: str) -> str:
+    """Return what to do about distorted cameras, of this camera model, of a scene."""
+    if model == ALL_AROUND:
+        return ALL_AROUND_HINT
     return f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`"
 
 

@@ -61,7 +61,7 @@ class FollowedRun:
     """
 
     def __init__(self, folder: Path, options: RenderOptions) -> None:
-        self._folder = folder.absolute()  # whose name is shown
+        self._folder, self._name = folder, folder.absolute().name
         self.options = options
         self._fields: dict[int, tuple[Stamp, GaussianField]] = {}
         self._placed: PlacedRasterizer | None = None
@@ -99,8 +99,8 @@ class FollowedRun:
         if self.problem is not None:
             return f"{self.problem}; showing level {levels} of {manifest.levels}"
         if manifest.complete:
-            return f"{self._folder.name}: {counted(manifest.levels, 'level')}"
-        return f"{self._folder.name} is not complete: showing level {levels} of {manifest.levels}; others will follow"
+            return f"{self._name}: {counted(manifest.levels, 'level')}"
+        return f"{self._name} is not complete: showing level {levels} of {manifest.levels}; others will follow"
 
     def _read(self) -> None:
         stamps = {self._folder / MANIFEST: _stamp(self._folder / MANIFEST)}
@@ -128,7 +128,7 @@ class FollowedRun:
         self.shown = None
         if fields:
             renderer = HierarchyRenderer.of(manifest, fields, self._placed.rasterizer)
-            self.shown = ShownRun.of(archive.path().name, renderer, self._rig)
+            self.shown = ShownRun.of(archive.name, renderer, self._rig)
 
 
 class RunFollower:

@@ -132,7 +132,7 @@ class LiveView(Watcher):
             self._viewer.set_initial_view(InitialView.of_field(shown[manifest.levels - 1]))
             self._begun = True
         rig = None if self._cameras is None else self._cameras.rig
-        run = ShownRun.of(self._archive.path().name, renderer, rig)
+        run = ShownRun.of(self._archive.name, renderer, rig)
         self._viewer.show(ViewerContent(run, None, self._cameras))
         self._page.status = (
             f"training level {stage.level} of {manifest.levels}: iteration {iteration:,} of {stage.iterations:,}, "

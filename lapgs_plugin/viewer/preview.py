@@ -78,7 +78,7 @@ def save_run_preview(run: Path, device: str = "auto", moved_to: Path | None = No
         with one_pool():
             archive = RunArchive.open(run)
             cameras = SceneCameras.of(archive, moved_to)
-            save_preview(archive, ShownRun.of(run.name, run_renderer(archive, device), cameras.rig), cameras.start)
+            save_preview(archive, ShownRun.of(archive.name, run_renderer(archive, device), cameras.rig), cameras.start)
 
 
 @contextmanager

@@ -9,9 +9,11 @@ from PIL import Image
 from rich.table import Table
 
 from lapgs_plugin.cli import prepare
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.output import make_console
-from lapgs_plugin.errors import MissingExtraError
+from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.training import backend
+from tests.cli.commands import succeeding
 
 WORDS = "word " * 40 + "end"
 
@@ -66,3 +68,27 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
     Image.new("L", size).save("desk/images/left/a.png")
     command = prepare._next_command(Path("desk"), ["left/a.webp", *(f"left/{i}.webp" for i in range(24))])
     assert command == f"lapgs train desk -o runs/desk --eval{options}"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("train desk -o runs/desk", "desk: no such scene folder; "),
+        ("train empty -o runs/desk", "empty: neither a COLMAP model "),
+        ("train desk -o full", "full is not empty and not a run "),
+        ("train desk -o full/train.py/x", "--out full/train.py/x: full/train.py is a file; "),
+        ("run --device cpu full/train.py", "full/train.py is not the training script "),
+        ("eval runs/desk", "runs/desk does not exist, "),
+        ("render empty", "empty has no manifest.json, "),
+        ("view empty", "empty has no manifest.json, "),
+    ],
+)
+def test_messages_name_folders_as_they_were_typed(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("empty", "full"):
+        Path(folder).mkdir()
+    Path("full/train.py").write_text("import json\n")
+    with pytest.raises(UserInputError, match=f"^{message}"):
+        succeeding(app, 120)(*words.split())

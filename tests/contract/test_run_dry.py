@@ -240,8 +240,11 @@ def test_what_begins_later_is_tried_before_the_base_is_trained(later: str, scene
     assert (tmp_path / "run").exists() == trains
 
 
-def test_depths_that_are_rasterized_before_the_image_change_no_iteration(scene: Path, tmp_path: Path) -> None:
-    """Before a stage trains it is known which of the renderer's colours are the model's."""
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_depths_that_are_rasterized_before_the_image_change_no_iteration(
+    hierarchy: str, scene: Path, tmp_path: Path
+) -> None:
+    """Before a stage trains it is known which of the renderer's colours are the model's, without a dry run, too."""
     checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
     renderer, call = checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py", "    rendered_image, radii, depth_"
     text = renderer.read_text(encoding="utf-8")
@@ -270,7 +273,7 @@ def test_depths_that_are_rasterized_before_the_image_change_no_iteration(scene: 
             captured(tmp_path, []),
             loaded(STUBS["graphdeco"], scene, tmp_path / folder, *options, script=script) as one,
         ):
-            drive(one, hierarchy="laplacian", hooks=(Counting(),))
+            drive(one, hierarchy=hierarchy, hooks=(Counting(),), split="1/3,2/3")
     plain, other = (RunArchive.open(tmp_path / name).field(0) for name in ("plain", "with_depths"))
     for name, value in plain.parameters.items():
         torch.testing.assert_close(other.parameters[name], value)  # worst seen: equal

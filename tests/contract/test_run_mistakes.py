@@ -476,6 +476,8 @@ def test_defaults_go_with_the_hierarchy(
     assert {name: {"inherit": manifest.inherit, **manifest.settings}[name] for name in settings} == settings
     assert [record.iterations for record in manifest.records] == iterations
     assert [record.signed for record in manifest.records] == [False, "nested" not in words]
+    code, lines = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
+    assert (code, lines[-1].partition(" already holds a run")[0]) == (2, "lapgs: run")
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ from lapgs_plugin.scenes import Scene, load_scene
 from lapgs_plugin.scenes.colmap import find_model, read_colmap
 from lapgs_plugin.scenes.colmap_binary import check_whole
 from lapgs_plugin.scenes.colmap_text import check_text
+from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
+from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 
 POINTS = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 3))
 COLORS = np.random.default_rng(4).integers(0, 256, (40, 3))
@@ -245,8 +247,25 @@ def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: b
     with pytest.raises(SceneError, match=r"cam 2/x\.JPG: no such image; put it there"):
         load(path)  # two files differ in case alone
     (path / "images" / names[0]).unlink()
-    with pytest.raises(SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\)"):
+    with pytest.raises(
+        SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\).*, or leave them out with"
+    ):
         load(path)
+
+
+def test_smaller_copies_may_have_another_format(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(("a.1.JPG", "a.2.JPG", "b/c.jpg")))
+    copies = {"a.1.png": (24, 16), "a.2.PNG": (24, 16), "b/c.tif": (24, 16)}
+    write_images(path / "images_4_png", copies)
+    (path / "images_4_png" / "a.1.txt").write_text("no photo")
+    scene = load(path, images="images_4_png")
+    assert [view.name for view in scene.train] == ["a.1.JPG", "a.2.JPG", "b/c.jpg"]
+    for view, name in zip(scene.train, copies, strict=True):
+        assert view.camera.size == (24, 16)
+        torch.testing.assert_close(view.image, torch.full((3, 16, 24), sum(name.encode()) % 256 / 255.0))
+    (path / "images_4_png" / "a.1.bmp").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"images_4_png/a\.1\.JPG: no such image"):
+        load(path, images="images_4_png")
 
 
 def test_two_names_of_one_photo_are_refused(tmp_path: Path) -> None:
@@ -332,6 +351,13 @@ def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: st
     assert_one_line(caught)
 
 
+def test_photos_that_see_all_around_cannot_be_undistorted(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, Model(cameras={1: "EQUIRECTANGULAR 96 64 96 64"}))
+    with pytest.raises(SceneError, match="sees all around, which no pinhole image shows; cut") as caught:
+        load(path)
+    assert "lapgs prepare" not in str(caught.value)
+
+
 def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:
     model, names = pycolmap.Reconstruction(), [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     for key, name in enumerate(names, start=1):
@@ -383,6 +409,18 @@ def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
         load(tmp_path / "keyframes" / "images")
 
 
+def test_a_model_beside_its_photos_is_to_be_prepared(tmp_path: Path) -> None:
+    """COLMAP's window exports a model to the folder that it is given."""
+    path = make_scene(tmp_path / "export")
+    (path / "sparse/0").rename(tmp_path / "model")
+    for file in (*(tmp_path / "model").iterdir(), *(path / "images").iterdir()):
+        file.rename(path / file.name)
+    with pytest.raises(SceneError, match=f"its model with `lapgs prepare {path} OUT --model {path}`"):
+        load(path)
+    prepare_scene(path, tmp_path / "out", PrepareSettings(model=path), progress=False)
+    assert len(load(tmp_path / "out").train) == 10
+
+
 def test_wrong_resolution_comes_first(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="--resolution"):
         load(tmp_path / "none", resolution="huge")
@@ -427,10 +465,12 @@ def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
     assert_one_line(caught)
 
 
-def test_model_without_points(tmp_path: Path) -> None:
-    path = make_scene(tmp_path, Model(points=np.empty((0, 3))))
-    with pytest.raises(SceneError, match="the model has no 3D points"):
-        load(path)
+def test_a_model_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = load(make_scene(tmp_path, Model(points=np.empty((0, 3)))))
+    assert "the model has no 3D points; training starts from random ones" in caplog.text
+    middle, reach = scene.points.mean(dim=0), (scene.points.amax(dim=0) - scene.points.amin(dim=0)).min() / 2
+    assert middle.norm() < 0.2  # the cameras look past the origin by at most 0.19; seen 0.13
+    assert scene.train[0].camera.position.norm() / 2 < reach
 
 
 def test_points_with_nan(tmp_path: Path) -> None:
@@ -444,8 +484,23 @@ def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
     with pytest.raises(SceneError, match="images_4: no such folder of images; choose images with --images"):
         load(path, images="images_4")
-    shutil.rmtree(path / "images")
+    (path / "images").rename(path / "Fotos März")
+    with pytest.raises(SceneError, match="images: no such folder of images; choose Fotos März with --images"):
+        load(path)
+    assert len(load(path, images="Fotos März").train) == len(Model().names)
+    shutil.rmtree(path / "Fotos März")
     with pytest.raises(SceneError, match="images: no such folder of images; put the photos"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "images/06.png"]
+)
+def test_files_that_a_clone_without_git_lfs_lacks(tmp_path: Path, name: str) -> None:
+    path = make_scene(tmp_path)
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 128\n"
+    (path / name).write_text(pointer)
+    with pytest.raises(SceneError, match=rf"{name}: a pointer of Git LFS, .*`git lfs pull`"):
         load(path)
 
 

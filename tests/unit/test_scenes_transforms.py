@@ -276,7 +276,7 @@ def test_a_ply_that_is_not_there_is_told(tmp_path: Path, name: str, caplog: pyte
     assert not caplog.records
     edit(tmp_path, {"ply_file_path": name})
     assert torch.equal(load(tmp_path).points, random)
-    assert "no such file; random points are used instead of it" in caplog.text
+    assert "no such file; training starts from random points" in caplog.text
 
 
 def test_points_with_float_colors_or_none(tmp_path: Path) -> None:
@@ -494,6 +494,16 @@ def test_pair_without_its_test_file(tmp_path: Path) -> None:
     (path / "transforms_test.json").unlink()
     refused(path, r"transforms_test\.json: no such file.*without --eval", eval=True)
     assert len(load(path).train) == 9
+
+
+def test_views_for_validation_are_held_out_if_there_are_none_for_tests(tmp_path: Path) -> None:
+    path = nerf_scene(tmp_path)
+    (path / "transforms_test.json").rename(path / "transforms_val.json")
+    assert [len(views) for views in (load(path, eval=True).train, load(path, eval=True).test)] == [9, 3]
+    assert len(load(path).train) == 12
+    values = json.loads((path / "transforms_val.json").read_text())
+    (path / "transforms_test.json").write_text(json.dumps({**values, "frames": values["frames"][:1]}))
+    assert len(load(path, eval=True).test) == 1
 
 
 def test_too_few_views(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.scene import check_shape, check_source
-from lapgs_plugin.scenes.source import PINHOLE_MODELS, Frame, SceneSource
+from lapgs_plugin.scenes.source import ALL_AROUND, ALL_AROUND_HINT, PINHOLE_MODELS, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
 """Where the photos of these models are."""
@@ -103,7 +103,8 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
                 f"{option_name(field)}: {place} has the cameras already; leave the option out, or give a folder of "
                 "photos without a model"
             )
-    if find_model(place, (".",)) is not None:
+    transforms = find_model(place, (".",)) is None
+    if not transforms:
         model = _without_rigs(read_model(place))
         model.tear_down()  # of images without a pose, and cameras without images
         _check_lenses(model, place)
@@ -120,17 +121,20 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     there = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
     if frames and not there:
-        advice = "put them there" if place == photos else "give the folder of the photos, and the model with --model"
+        advice = "put them there" if transforms else "give the folder of the photos, and the model with --model"
         first = min(frame.path for frame in frames)
         raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
-    kinds, trained = {camera.model.name for camera in model.cameras.values()}, (photos, find_model(photos))
-    if settings.max_size is None and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"} and place in trained and not left_out:
+    kinds = {camera.model.name for camera in model.cameras.values()}
+    as_it_is = (transforms or place == find_model(photos)) and not left_out and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}
+    if settings.max_size is None and as_it_is:
         raise UserInputError(
             f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
             "cameras again, give a folder of photos without a model"
         )
     check_source(photos, replace(source, train=there))
     check_targets(photos, [(frame.name, frame.name) for frame in there])
+    for warning in source.warnings:
+        logger.warning(warning)
     if left_out:
         logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
     frame_of = {image.name: image.frame_id for image in model.images.values()}
@@ -167,8 +171,8 @@ def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _check_lenses(model: pycolmap.Reconstruction, place: Path) -> None:
     for key, camera in model.cameras.items():
         who = f"{place}: camera {key} ({camera.model.name})"
-        if camera.model.name == "EQUIRECTANGULAR":
-            raise SceneError(f"{who} sees all around, which no pinhole image shows; cut its photos into several first")
+        if camera.model.name == ALL_AROUND:
+            raise SceneError(f"{who}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
 
@@ -195,6 +199,8 @@ def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> t
     """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
     if kind in PINHOLE_MODELS and not distortion:
         return "PINHOLE", []
+    if kind == ALL_AROUND:
+        raise SceneError(f"{frame.path}: its camera is {kind}: {ALL_AROUND_HINT}")
     model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
     values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
     if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):

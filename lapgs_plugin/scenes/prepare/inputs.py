@@ -84,15 +84,15 @@ def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
     return {name: masks[photo] for name, photo in own.items()}
 
 
-def read_sizes(job: Job) -> dict[str, tuple[int, int]]:
-    """Return width and height of each photo by name. Photos are decoded, to find damaged ones before the long steps."""
+def read_sizes(job: Job, decode: bool = True) -> dict[str, tuple[int, int]]:
+    """Return width and height of each photo by name. `decode` finds damaged ones, before steps that take long."""
 
     refused: dict[str, SceneError] = {}
 
     def size(name: str) -> tuple[int, int]:
         photo = job.photo(name)
         try:
-            width, height = check_image(photo)
+            width, height = check_image(photo) if decode else image_size(photo)
             share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))
             pixels, subject = (
                 int(width * share) * int(height * share),

@@ -110,7 +110,7 @@ def _undistort(given: Given, out: Path, overwrite: bool, progress: bool) -> Prep
     with writing_explained(out):
         job = Job(out / WORK, given.photos, given.settings, progress)
         with opened_work(job.work, _identity(given.photos, given.settings), overwrite):
-            given.check_sizes(read_sizes(job))
+            given.check_sizes(read_sizes(job, decode=False))
             make_masks(job)
             write_scene(job, model)
         move_into_place(job.work, out)
