@@ -82,7 +82,7 @@ class RunArchive(RunFiles):
                 # If this is interrupted, the folder holds the old run without its checkpoint, which the new run must
                 # never continue from, or an empty run, but never a manifest without its fields.
                 archive.path(CHECKPOINT).unlink(missing_ok=True)
-                archive._write_json(MANIFEST, asdict(manifest), training=True)
+                archive._write_json(archive.path(MANIFEST), asdict(manifest), training=True)
                 remove_results(folder)
         except BaseException:
             archive.close()
@@ -208,7 +208,7 @@ class RunArchive(RunFiles):
                 field.save_ply(path)
             for name, learned in ((EXPOSURE, exposure), (POSES, poses)):
                 if learned is not None:
-                    self._write_json(str(path.with_name(name)), dict(learned), training=True)
+                    self._write_json(path.with_name(name), dict(learned), training=True)
             if optimizer_state is not None:
                 write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
@@ -259,14 +259,14 @@ class RunArchive(RunFiles):
         for name, learned in ((EXPOSURE, exposure), (POSES, poses)):
             if learned is not None:
                 path = self._extended_path(record.level, name, iterations)
-                self._write_json(str(path), dict(learned), training=True)
+                self._write_json(path, dict(learned), training=True)
         self._remove(METRICS, STABILITY, REPORT)
         self._write_manifest(manifest)
         self._settle_fields()
         self._remove(CHECKPOINT)
 
     def _write_manifest(self, manifest: Manifest) -> None:
-        self._write_json(MANIFEST, asdict(manifest), training=True)
+        self._write_json(self.path(MANIFEST), asdict(manifest), training=True)
         self._manifest = manifest
 
     def _settle_fields(self) -> None:

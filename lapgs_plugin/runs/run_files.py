@@ -98,11 +98,11 @@ class RunFiles:
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Replace the run's metrics: JSON with finite numbers. Needs no lock."""
-        self._write_json(METRICS, metrics)
+        self._write_json(self.path(METRICS), metrics)
 
     def write_stability(self, figures: dict[str, Any]) -> None:
         """Replace the run's flicker metrics: JSON with finite numbers. Needs no lock."""
-        self._write_json(STABILITY, figures)
+        self._write_json(self.path(STABILITY), figures)
 
     def metrics(self) -> dict[str, Any] | None:
         """Read the run's metrics; None if they were never measured.
@@ -168,9 +168,9 @@ class RunFiles:
         logger.warning("%s is of level %d, which is finished: it is not used", path, level)
         return None
 
-    def _write_json(self, name: str, values: dict[str, Any], training: bool = False) -> None:
+    def _write_json(self, path: Path, values: dict[str, Any], training: bool = False) -> None:
         text = json.dumps(values, indent=2, allow_nan=False) + "\n"
-        write_text(self.path(name), text, training=training)
+        write_text(path, text, training=training)
 
     def _remove(self, *names: str) -> None:
         with one_line_errors(self._folder):

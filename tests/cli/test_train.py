@@ -55,6 +55,30 @@ def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     return call
 
 
+def test_everything_of_a_run_by_relative_paths(
+    lapgs: Lapgs, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("data").symlink_to(scene.parent, target_is_directory=True)
+    words = ("train", "data/sample", "-o", "runs/a", "--eval", "--exposure", "on", "--refine-poses", "--sh-degree", "0")
+    commands = (
+        (*words, "--iterations", "12"),
+        (*words, "--resume", "--iterations", "16"),
+        ("eval", "runs/a"),
+        ("eval", "runs/a", "--trajectory", "orbit", "--frames", "2"),
+        ("render", "runs/a"),
+        ("export", "runs/a"),
+        ("export", "runs/a", "--merge", "--iterations", "4"),
+        ("report", "runs/a"),
+    )
+    for command in commands:
+        ended = lapgs(*command)
+        assert ended.returncode == 0, (command, ended.stderr)
+        assert str(tmp_path) not in ended.stderr
+    assert [each.name for each in Path("runs").iterdir()] == ["a"]
+    assert not Path("runs/a/runs").exists()
+
+
 def test_a_run_trains_and_a_second_one_into_it_is_refused(lapgs: Lapgs, scene: Path, tmp_path: Path) -> None:
     options = ("--eval", "--views-per-step", "3", "--joint", "0.25", "--inherit", "xyz:0.5", *SHORT)
     done = lapgs("train", scene, "-o", tmp_path / "run", *options)
