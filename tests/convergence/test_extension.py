@@ -63,10 +63,10 @@ def extend(path: Path, scene: Scene, asked: int | None = AFTER, monitor: Monitor
     resume(path, scene, settings, monitor=monitor or Monitor())
 
 
-def fails_at_the_manifest(self: RunArchive, name: str, values: dict[str, Any], training: bool = False) -> None:
-    if name == MANIFEST:
+def fails_at_the_manifest(self: RunArchive, path: Path, values: dict[str, Any], training: bool = False) -> None:
+    if path.name == MANIFEST:
         raise OSError("no room")
-    WRITE_JSON(self, name, values, training)
+    WRITE_JSON(self, path, values, training)
 
 
 def contents(path: Path) -> list[bytes]:
