@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
-from lapgs_plugin.checkouts.source import CheckoutSource
-from lapgs_plugin.checkouts.syntax import parsed_quietly
+from lapgs_plugin.checkouts.source import CheckoutSource, methods_of
+from lapgs_plugin.checkouts.syntax import called_names, parsed_quietly
 
 START = "create_from_pcd"
 """Method of the family's models that makes Gaussians of a scene's points."""
@@ -22,7 +22,8 @@ def explain_values_beside(source: CheckoutSource, parameters: Collection[str]) -
         source: the checkout.
         parameters: attributes of the model that are made from a field.
     """
-    methods = _methods(source.model[0], source.classes)
+    classes = source.classes
+    methods, _ = methods_of(classes[source.model[0]], classes)
     if START not in methods:
         return None
     made = _attributes(_executed(methods[START]), ast.Store)
@@ -33,16 +34,9 @@ def explain_values_beside(source: CheckoutSource, parameters: Collection[str]) -
     return f"its Gaussians ({source.model[1]}) are rendered with {names}, which {START}() makes and fields do not have"
 
 
-def _methods(name: str, classes: Mapping[str, ast.ClassDef]) -> dict[str, ast.FunctionDef]:
-    """Return the methods of a class and of its bases by name."""
-    bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name) and base.id in classes]
-    own = {each.name: each for each in classes[name].body if isinstance(each, ast.FunctionDef)}
-    return {key: each for base in bases if base != name for key, each in _methods(base, classes).items()} | own
-
-
 def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef]) -> set[str]:
     """Return names of attributes that the loop's renderers read whatever the options, also through model methods."""
-    called = _called(ast.walk(source.training))
+    called = set(called_names(ast.walk(source.training)))
     functions, waiting = dict(methods), list[str]()
     for use in source.rasterizers:
         holder = ast.walk(parsed_quietly(source.modules[use.holder]))
@@ -57,14 +51,8 @@ def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef]) ->
         nodes = list(_executed(functions[name]))
         found = _attributes(nodes, ast.Load)
         read |= found
-        waiting += [*found, *_called(nodes)]
+        waiting += [*found, *called_names(nodes)]
     return read
-
-
-def _called(nodes: Iterable[ast.AST]) -> set[str]:
-    """Return the names of functions that are called by their names alone."""
-    calls = (node.func for node in nodes if isinstance(node, ast.Call))
-    return {each.id for each in calls if isinstance(each, ast.Name)}
 
 
 def _attributes(nodes: Iterable[ast.AST], context: type[ast.expr_context]) -> set[str]:

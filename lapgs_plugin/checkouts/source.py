@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
-from lapgs_plugin.checkouts.syntax import executed_on_import, parsed, parsed_quietly, place
+from lapgs_plugin.checkouts.syntax import called_names, executed_on_import, parsed, parsed_quietly, place
 from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import as_pip_argument
@@ -113,7 +113,7 @@ class CheckoutSource:
         near = ""
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
             modules = dict(_reachable(script, (script.parent, root)))
-            found, close = _find_model(modules, root, _called(tree))
+            found, close = _find_model(modules, root, called_names(ast.walk(tree)))
             near = near or close
             if found is not None:
                 break
@@ -185,7 +185,7 @@ class CheckoutSource:
     def unknown_attributes(self, names: Iterable[str]) -> list[str]:
         """Return those of these attributes that no module of the checkout has; none if the model has foreign bases."""
         classes = self.classes
-        if not _methods(classes[self.model[0]], classes)[1]:
+        if not methods_of(classes[self.model[0]], classes)[1]:
             return []
         known = self.attributes
         return [name for name in names if name not in known]
@@ -311,25 +311,25 @@ def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]
     }
     nodes = {name: node for name, (node, _) in classes.items()}
     for name, (node, path) in sorted(classes.items(), key=lambda each: each[0] not in called):
-        methods, whole = _methods(node, nodes)
+        methods, whole = methods_of(node, nodes)
         if "training_setup" not in methods:
             continue
         where = place(path, root, node.lineno)
-        if whole and not methods.issuperset(MODEL_ROLES):
-            near = f"{name} in {where} lacks {', '.join(set(MODEL_ROLES) - methods)}, and no other of its imports"
+        if whole and (lacks := set(MODEL_ROLES) - methods.keys()):
+            near = f"{name} in {where} lacks {', '.join(lacks)}, and no other of its imports"
             continue
         return (name, where), ""
     return None, near
 
 
-def _methods(node: ast.ClassDef, classes: Mapping[str, ast.ClassDef]) -> tuple[set[str], bool]:
-    """Return the names of a class's methods with those of its bases, and whether all bases were found."""
-    methods, whole = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}, True
+def methods_of(node: ast.ClassDef, classes: Mapping[str, ast.ClassDef]) -> tuple[dict[str, ast.FunctionDef], bool]:
+    """Return the methods of a class by name, with those of its bases, and whether all bases were found."""
+    methods, whole = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}, True
     for base in node.bases:
         name = base.id if isinstance(base, ast.Name) else base.attr if isinstance(base, ast.Attribute) else ""
         if name in classes and classes[name] is not node:
-            more, found = _methods(classes[name], classes)
-            methods, whole = methods | more, whole and found
+            more, found = methods_of(classes[name], classes)
+            methods, whole = more | methods, whole and found
         else:
             whole = whole and name in ("object", "Module")
     return methods, whole
@@ -339,14 +339,10 @@ def _find_training(tree: ast.Module) -> ast.FunctionDef | None:
     """Return the function that the main block calls and that trains."""
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     blocks = [node for node in tree.body if isinstance(node, ast.If)]
-    called = [name for block in blocks for name in _called(block)]
+    called = [name for block in blocks for name in called_names(ast.walk(block))]
     # Some main blocks call a function that calls the one that trains.
-    called += [name for outer in called if outer in functions for name in _called(functions[outer])]
+    called += [name for outer in called if outer in functions for name in called_names(ast.walk(functions[outer]))]
     return next((functions[n] for n in called if n in functions and "backward" in _methods_called(functions[n])), None)
-
-
-def _called(node: ast.AST) -> list[str]:
-    return [n.func.id for n in ast.walk(node) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
 
 
 def _methods_called(node: ast.AST) -> set[str]:

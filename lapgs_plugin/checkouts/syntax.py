@@ -74,3 +74,8 @@ def _stored(node: ast.AST) -> set[str]:
 def place(path: Path, root: Path, line: int) -> str:
     """Return a line of a file as `file:line`, relative to the checkout's root if the file is below it."""
     return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"
+
+
+def called_names(nodes: Iterable[ast.AST]) -> list[str]:
+    """Return the names of functions that are called by their names alone, one for each call."""
+    return [n.func.id for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]

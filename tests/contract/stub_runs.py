@@ -7,6 +7,7 @@ import math
 import random
 import re
 import runpy
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -275,6 +276,15 @@ def run_hierarchy(
             **options,
         )
     return RunArchive.open(folder), results[0]
+
+
+def edited_graphdeco(folder: Path, file: str, text: str, instead: str) -> Path:
+    """Copy the stubs to a folder, change a text that a file of graphdeco's has once, and return its script."""
+    root = Path(shutil.copytree(CHECKOUTS, folder, ignore=shutil.ignore_patterns("__pycache__"))) / "graphdeco"
+    content = (root / file).read_text(encoding="utf-8")
+    assert content.count(text) == 1
+    (root / file).write_text(content.replace(text, instead), encoding="utf-8")
+    return root / "train.py"
 
 
 drive_residuals = partial(drive, hierarchy="laplacian")

@@ -20,7 +20,17 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runner import dry_run
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runs.archive import RunArchive
-from tests.contract.stub_runs import CHECKOUTS, NAMES, STUBS, Result, captured, drive, loaded, run_bare
+from tests.contract.stub_runs import (
+    CHECKOUTS,
+    NAMES,
+    STUBS,
+    Result,
+    captured,
+    drive,
+    edited_graphdeco,
+    loaded,
+    run_bare,
+)
 
 SHORT = ("--iterations", 15)
 
@@ -224,11 +234,8 @@ LATER = {
 @pytest.mark.parametrize("later", LATER)
 def test_what_begins_later_is_tried_before_the_base_is_trained(later: str, scene: Path, tmp_path: Path) -> None:
     """As of forks that regularise normals from the middle of a run on."""
-    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
-    script = checkouts / "graphdeco" / "train.py"
-    text, line = script.read_text(encoding="utf-8"), "        Ll1depth = 0\n"
-    assert text.count(line) == 1
-    script.write_text(text.replace(line, line + LATER[later]), encoding="utf-8")
+    line = "        Ll1depth = 0\n"
+    script = edited_graphdeco(tmp_path / "c", "train.py", line, line + LATER[later])
     message = r"train.py:\d+: the loop trains on an image of other colours .* --hierarchy nested"
     trains = later != "a loss of depths"
     with (
@@ -299,10 +306,7 @@ def test_a_model_without_the_parameters_of_a_field(hierarchy: str, scene: Path, 
 
 def test_a_model_that_computes_its_parameters_has_no_residuals(scene: Path, tmp_path: Path) -> None:
     """As EAGLES', which decodes them; a residual's model starts from a finished field."""
-    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
-    path, line = checkouts / "graphdeco" / "scene" / "gaussian_model.py", "class GaussianModel(GaussianBase):\n"
-    text = path.read_text(encoding="utf-8")
-    assert text.count(line) == 1
+    line = "class GaussianModel(GaussianBase):\n"
     computed = """\
     def __setattr__(self, name, value):
         super().__setattr__("latents" if name == "_rotation" else name, value)
@@ -312,8 +316,7 @@ def test_a_model_that_computes_its_parameters_has_no_residuals(scene: Path, tmp_
         return self.latents
 
 """
-    path.write_text(text.replace(line, line + computed), encoding="utf-8")
-    script = checkouts / "graphdeco" / "train.py"
+    script = edited_graphdeco(tmp_path / "c", "scene/gaussian_model.py", line, line + computed)
     with (
         captured(tmp_path, []),
         loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,

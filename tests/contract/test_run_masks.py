@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import SceneError, UserInputError
-from tests.contract.stub_runs import CHECKOUTS, STUBS, captured, drive, loaded, run_hierarchy
+from tests.contract.stub_runs import STUBS, captured, drive, edited_graphdeco, loaded, run_hierarchy
 
 SHORT = ("--iterations", 18, "--densify_from_iter", 3, "--densification_interval", 3, "--densify_until_iter", 12)
 
@@ -63,10 +63,7 @@ def test_masks_that_do_not_fit_end_before_anything_is_written(scene: Path, tmp_p
 
 def test_a_map_that_is_rasterized_before_the_image_gets_no_photo(scene: Path, tmp_path: Path) -> None:
     """Not in the first iteration either, without a dry run."""
-    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
-    renderer, call = checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py", "    rendered_image, radii, depth_"
-    text = renderer.read_text(encoding="utf-8")
-    assert text.count(call) == 1
+    call = "    rendered_image, radii, depth_"
     grey = """\
     red, green, _ = rasterizer(
         means3D=pc.get_xyz,
@@ -78,7 +75,7 @@ def test_a_map_that_is_rasterized_before_the_image_gets_no_photo(scene: Path, tm
     )[0]
     assert torch.equal(red, green)
 """
-    renderer.write_text(text.replace(call, grey + call), encoding="utf-8")
-    hidden, script = _hide(scene, tmp_path / "scene", 0), checkouts / "graphdeco" / "train.py"
+    script = edited_graphdeco(tmp_path / "c", "gaussian_renderer/__init__.py", call, grey + call)
+    hidden = _hide(scene, tmp_path / "scene", 0)
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], hidden, tmp_path / "run", *SHORT, script=script) as adapter:
         drive(adapter, levels=1)
