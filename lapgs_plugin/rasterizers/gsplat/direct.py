@@ -101,8 +101,9 @@ def _render(
             options = cameras, background, degree, field.signed, describes, absgrad, box, targets
             image: Tensor = _Render.apply(means, quaternions, log_scales, logits, sh, *options)  # type: ignore[no-untyped-call]  # torch's
             return image, box[0], targets
+        ours = our_kernels_blend(means, len(cameras.poses) * cameras.width * cameras.height)
         found = forward(
-            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes, ours=False
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes, ours
         )
     return _channels_first(found.blended.images), found, targets
 
@@ -137,8 +138,8 @@ class _Render(torch.autograd.Function):
         from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
 
         means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
-        given, blended = ToBlend(*rest[:7]), Blended(*rest[7:11])
-        found, (width, height) = Intermediates(given, blended, *rest[11:]), ctx.size
+        given, blended = ToBlend(*rest[:8]), Blended(*rest[8:12])
+        found, (width, height) = Intermediates(given, blended, *rest[12:]), ctx.size
         by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
@@ -148,15 +149,15 @@ class _Render(torch.autograd.Function):
             compiled.CameraModelType.PINHOLE, found.radii, given.conics, None,
             by_means2d, bindings.zeros(found.depths.shape, means.device), by_conics, None, False,
         )  # fmt: skip
-        by_sh = finish_gradients(
-            means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities,
+        by_sh, by_logits = finish_gradients(
+            means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities[0],
             by_colors, by_means, by_scales, by_opacities,
         )  # fmt: skip
         by_absolute = by_absolute if ctx.absgrad else None
         if len(poses) == 1:
             by_means2d, by_absolute = by_means2d[0], None if by_absolute is None else by_absolute[0]
         _write_gradients(ctx.targets, by_means2d, by_absolute)
-        return by_means, by_quaternions, by_scales, by_opacities[0], by_sh, *[None] * 8
+        return by_means, by_quaternions, by_scales, by_logits, by_sh, *[None] * 8
 
 
 def forward(
@@ -170,12 +171,13 @@ def forward(
     scales, opacities = activate(log_scales, logits)
     projected = bindings.project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
     radii, means2d, depths, conics = projected
-    pixels = means2d if describes else None
-    colors, visible_radii, centres = visible_colors(means, cameras.centres, sh, degree, signed, radii, pixels)
-    opacities = _for_each_camera(opacities, count)
+    colors, visible_radii, centres, records = visible_colors(
+        means, cameras.centres, sh, degree, signed, radii, describes, (means2d, conics, opacities), ours
+    )
+    opacities = _for_each_camera(opacities, 1 if ours else count)
     tiles = bindings.sort_into_tiles(projected, size, count)
-    given = ToBlend(means2d, conics, colors, opacities, background, *tiles)
-    return Intermediates(given, blend(given, size, ours), radii, depths, scales, visible_radii, centres)
+    given = ToBlend(means2d, conics, colors, opacities, background, *tiles, records)
+    return Intermediates(given, blend(given, size), radii, depths, scales, visible_radii, centres)
 
 
 def _for_each_camera(values: Tensor, cameras: int) -> Tensor:

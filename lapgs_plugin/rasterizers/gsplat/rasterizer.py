@@ -28,6 +28,7 @@ from lapgs_plugin.fields.rasterizer import (
     require_color,
 )
 from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
@@ -172,7 +173,7 @@ class GsplatRasterizer(Rasterizer):
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
-        direct = self._calls_kernels(*fields) and stacking_works()
+        direct = self._calls_kernels(*fields) and stacking_works() and our_kernels_blend(fields[0].means)
         return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
 
     def _calls_kernels(self, *fields: GaussianField) -> bool:
