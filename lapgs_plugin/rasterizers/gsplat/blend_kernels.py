@@ -137,12 +137,14 @@ def _ballot(wanted: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _bits_before(word: tl.tensor) -> tl.tensor:
-    """Return for each of 32 threads how many of the bits before its own are set."""
-    lane = tl.arange(0, 32)
+def _count_bits(x: tl.tensor) -> tl.tensor:
+    """Return how many bits of each number are set."""
     if INTERPRETED:
-        return tl.cumsum((word >> lane) & 1, 0) - ((word >> lane) & 1)
-    return tl.inline_asm_elementwise("popc.b32 $0, $1;", "=r,r", [word & ((1 << lane) - 1)], tl.int32, True, 1)
+        count = tl.zeros_like(x)
+        for i in tl.static_range(32):
+            count += (x >> i) & 1
+        return count
+    return tl.inline_asm_elementwise("popc.b32 $0, $1;", "=r,r", [x], tl.int32, True, 1)
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -252,28 +254,44 @@ def _first_word(index: tl.tensor, begin: tl.tensor, regions: tl.constexpr) -> tl
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _pairs(
+    begin: tl.tensor, stop: tl.tensor, flat: tl.tensor, words: tl.tensor, regions: tl.constexpr
+) -> tuple[tl.tensor, tl.tensor]:
+    """Load the next 64 pairs: their Gaussians, and the words that say for each 32 which of them reach the region."""
+    pair = tl.arange(0, 64)
+    gaussian = tl.load(flat + begin + pair, begin + pair < stop, 0)
+    return gaussian, tl.load(words + pair // 32 * regions, begin + pair // 32 * 32 < stop, 0)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _fill(
     queue: tl.tensor, begin: tl.tensor, stop: tl.tensor, head: tl.tensor, tail: tl.tensor,
-    flat: tl.tensor, words: tl.tensor, regions: tl.constexpr, bucket: tl.constexpr,
+    gaussian: tl.tensor, word: tl.tensor, flat: tl.tensor, words: tl.tensor,
+    regions: tl.constexpr, bucket: tl.constexpr,
 ) -> tuple[tl.tensor, ...]:  # fmt: skip
     """Put Gaussians that reach the region in the queue, until it has a bucket of them or the pairs end.
 
+    Args:
+        gaussian, word: of the next 64 pairs. Those after are loaded before they are needed, because loading takes as
+            long as blending many Gaussians.
+
     Returns:
-        The next pair and its word, and how many Gaussians have entered the queue.
+        The next pair and its word, how many Gaussians have entered the queue, and the next `gaussian` and `word`.
     """
-    lane = tl.arange(0, 32)
+    pair = tl.arange(0, 64)
     while (begin < stop) & (tail - head < bucket):
-        word = tl.load(words)
-        wanted = (word >> lane) & 1
-        gaussian = tl.load(flat + begin + lane, wanted != 0, 0)
-        slot = (tail + _bits_before(word)) & 63
+        wanted = (word >> (pair % 32)) & 1
+        before = _count_bits(word & ((1 << (pair % 32)) - 1))
+        before += tl.where(pair < 32, 0, tl.sum(tl.where(pair < 32, wanted, 0), 0))
+        slot = (tail + before) & 127
         tl.debug_barrier()  # all threads have read the bucket before
         tl.store(queue + slot, gaussian, wanted != 0)
-        tl.debug_barrier()  # threads read what others wrote
         tail += tl.sum(wanted, 0)
-        begin += 32
-        words += regions
-    return begin, words, tail
+        begin += 64
+        words += 2 * regions
+        gaussian, word = _pairs(begin, stop, flat, words, regions)
+        tl.debug_barrier()  # threads read what others wrote
+    return begin, words, tail, gaussian, word
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -289,7 +307,7 @@ def _bucket(
     # Which Gaussian of a bucket an element is; those in one thread are consecutive.
     order = tl.arange(0, splat_lanes)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
     order = tl.broadcast_to(order, (lanes, splat_lanes, splats, 1)) + head
-    gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & 63), tail > 0, another)
+    gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & 127), tail > 0, another)
     x, y, a, b = _load_four(records + record * gaussian)
     c, opacity, _, _ = _load_four(records + record * gaussian + 4)
     red, green, blue, _ = _load_four(records + record * gaussian + 8)
@@ -344,10 +362,13 @@ def _forward_kernel(
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
     another = tl.load(flat + begin, begin < stop, 0)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
-    queue = queues + tl.program_id(0) * 64  # room for a word's pairs and almost a bucket
+    queue = queues + tl.program_id(0) * 128  # room for 64 pairs and almost a bucket
+    gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0
     while (begin < stop) | (head < tail):
-        begin, words, tail = _fill(queue, begin, stop, head, tail, flat, words, regions, bucket)
+        begin, words, tail, gaussians, word = _fill(
+            queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+        )
         _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
             queue, head, tail, another, records, lanes, splats, record
         )
@@ -443,10 +464,13 @@ def _backward_kernel(
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
     another = tl.load(flat + begin, begin < stop, 0)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
-    queue = queues + tl.program_id(0) * 64
+    queue = queues + tl.program_id(0) * 128
+    gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0  # numbers of Gaussians that left the queue and that entered it
     while head < count:
-        begin, words, tail = _fill(queue, begin, stop, head, tail, flat, words, regions, bucket)
+        begin, words, tail, gaussians, word = _fill(
+            queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+        )
         gaussian, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
             queue, head, tail, another, records, lanes, splats, record
         )
@@ -516,7 +540,7 @@ def blend_forward(
     images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
-        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 2 * WARP),
+        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 4 * WARP),
         *numbers, lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         num_warps=1, **FUSED,
     )  # fmt: skip
@@ -549,7 +573,7 @@ def blend_backward(
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     _backward_kernel[(programs,)](
         records, offsets, flat, words, counts, images, by_images, found, others,
-        flat.new_empty(programs, 2 * WARP), *numbers,
+        flat.new_empty(programs, 4 * WARP), *numbers,
         lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         absolute=absolute, num_warps=1, **FUSED,
     )  # fmt: skip
