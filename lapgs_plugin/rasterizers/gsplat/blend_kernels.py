@@ -70,6 +70,8 @@ SHAPE = Shape()
 REACH_WARPS = 4
 """Of a program of the launch before; each thread tests a pair at once."""
 SPLIT_BLOCK = 256
+FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
+"""At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -333,10 +335,12 @@ def _transmittances(
     """Return the transmittances before and after each Gaussian, and after the bucket."""
     left = 1.0 - alpha
     second = tl.arange(0, alpha.shape[2])[None, None, :, None] == 1  # of a thread's Gaussians
-    before, product = _product_before(tl.reduce(left, 2, _multiply, keep_dims=True), lanes)
-    first = tl.reduce(tl.where(second, 1.0, left), 2, _multiply, keep_dims=True)
-    before = transmittance * before * tl.where(second, first, 1.0)
-    return before, before * left, transmittance * product
+    by_both = tl.reduce(left, 2, _multiply, keep_dims=True)
+    by_first = tl.reduce(tl.where(second, 1.0, left), 2, _multiply, keep_dims=True)
+    before, by_all = _product_before(by_both, lanes)
+    before *= transmittance
+    after = before * tl.where(second, by_both, by_first)
+    return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -365,14 +369,19 @@ def _forward_kernel(
     queue = queues + tl.program_id(0) * 128  # room for 64 pairs and almost a bucket
     gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0
-    while (begin < stop) | (head < tail):
+    begin, words, tail, gaussians, word = _fill(
+        queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+    )
+    _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
+        queue, head, tail, another, records, lanes, splats, record
+    )
+    while head < tail:
+        # The next bucket is loaded before this one is blended, because loading takes as long.
+        head += bucket
         begin, words, tail, gaussians, word = _fill(
             queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
         )
-        _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
-            queue, head, tail, another, records, lanes, splats, record
-        )
-        head += bucket
+        following = _bucket(queue, head, tail, another, records, lanes, splats, record)
         alpha = _alphas(x - (column + 0.5 + along), y - (row + 0.5 + down), a, b, c, opacity, there)
         before, after, transmittance = _transmittances(alpha, transmittance, lanes)
         weight = tl.where(after > LEAST, alpha * before, 0.0)
@@ -382,6 +391,7 @@ def _forward_kernel(
         cover += tl.sum(weight, 2, keep_dims=True)
         if tl.max((transmittance > LEAST).to(tl.int32)) == 0:  # all pixels ended
             begin, tail = stop, head
+        _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = following
     tl.store(counts + tl.program_id(0), tl.minimum(head, tail))
 
     pixel = images + 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
@@ -458,7 +468,7 @@ def _backward_kernel(
     behind = red * tl.load(images + pixel, inside, 0.0)
     behind += green * tl.load(images + pixel + 1, inside, 0.0) + blue * tl.load(images + pixel + 2, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
-    number = tl.arange(0, splats)[None, None, :, None]  # of a thread's Gaussians
+    second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
     begin, count = tl.load(offsets + index), tl.load(counts + tl.program_id(0))
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
@@ -482,16 +492,14 @@ def _backward_kernel(
         before, after, transmittance = _transmittances(alpha, transmittance, lanes)
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
         weight = alpha * before
-        shine = color_r * red + color_g * green + color_b * blue
-        added = weight * shine
-        added_before, added_by_all = _sum_before(tl.sum(added, 2, keep_dims=True), lanes)
-        # The first of a thread's two Gaussians has what the second adds behind it.
-        by_second = tl.sum(tl.where(number == splats - 1, added, 0.0), 2, keep_dims=True)
-        by_later = tl.where(number == splats - 1, 0.0, by_second)
-        upto = added_before + (tl.sum(added, 2, keep_dims=True) - by_later)
-        by_alpha = before * shine - (behind - upto) * inverse
-        behind -= added_by_all
-        by_sigma = tl.where(alpha < OPAQUEST, -alpha * by_alpha, 0.0)
+        added = weight * (color_r * red + color_g * green + color_b * blue)
+        by_both = tl.sum(added, 2, keep_dims=True)
+        by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
+        added_before, by_all = _sum_before(by_both, lanes)
+        still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
+        behind -= by_all
+        # The gradient by alpha, times -alpha.
+        by_sigma = tl.where(alpha < OPAQUEST, still_behind * (alpha * inverse) - added, 0.0)
         _add_gradients(
             x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue,
             gaussian, there, gradients, others, lanes, absolute,
@@ -542,7 +550,7 @@ def blend_forward(
     _forward_kernel[(programs,)](
         records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 4 * WARP),
         *numbers, lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        num_warps=1, **FUSED,
+        num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
     )  # fmt: skip
     return images, counts, words
 
@@ -575,7 +583,7 @@ def blend_backward(
         records, offsets, flat, words, counts, images, by_images, found, others,
         flat.new_empty(programs, 4 * WARP), *numbers,
         lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, num_warps=1, **FUSED,
+        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
     )  # fmt: skip
     leading = records.shape[:-1]
     by_means2d, by_conics = records.new_empty(*leading, 2), records.new_empty(*leading, 3)
