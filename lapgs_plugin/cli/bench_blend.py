@@ -25,7 +25,7 @@ def blend(
     shapes: Annotated[
         str | None,
         typer.Option(
-            metavar="LANESxROWS[xSPLATS],...",
+            metavar="ROWS[xSPLATS],...",
             help="Shapes of our kernel to time. Default: the one that training uses.",
         ),
     ] = None,

@@ -49,10 +49,10 @@ class Kernels(NamedTuple):
 
 
 def parse_shapes(text: str | None) -> dict[str, Shape]:
-    """Parse shapes such as "4x4x2,8x2x1", in the order of `blend_kernels.Shape`; None for the default one.
+    """Parse shapes such as "4x2,8x1", in the order of `blend_kernels.Shape`; None for the default one.
 
     Raises:
-        UserInputError: an entry is not 2 or 3 powers of 2, or has too many columns, rows, Gaussians or regions.
+        UserInputError: an entry is not one or two powers of 2, or has too many rows or Gaussians, or too few rows.
     """
     from lapgs_plugin.rasterizers.gsplat import bindings, blend_kernels
 
@@ -61,18 +61,12 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
     shapes = {}
     for entry in text.split(","):
         numbers = [int(number) if number.isdecimal() else 0 for number in entry.strip().split("x")]
-        if not 2 <= len(numbers) <= 3 or any(number < 1 or number & (number - 1) for number in numbers):
-            raise UserInputError(f"--shapes {entry!r}: expected 2 or 3 powers of 2 such as 4x4x2")
+        if not 1 <= len(numbers) <= 2 or any(number < 1 or number & (number - 1) for number in numbers):
+            raise UserInputError(f"--shapes {entry!r}: expected one or two powers of 2 such as 4x2")
         shape = blend_kernels.Shape(*numbers)
-        if shape.lanes not in (4, 8) or shape.rows > bindings.TILE or shape.splats > 2:
+        if not 2 <= shape.rows <= bindings.TILE or shape.splats > 2:
             raise UserInputError(
-                f"--shapes {entry!r}: expected LANESxROWS[xSPLATS] with 4 or 8 LANES, at most {bindings.TILE} "
-                "ROWS and 1 or 2 SPLATS"
-            )
-        if shape.regions > blend_kernels.WARP:
-            raise UserInputError(
-                f"--shapes {entry!r}: expected at most {blend_kernels.WARP} regions in a tile, not {shape.regions}; "
-                "make LANES or ROWS larger"
+                f"--shapes {entry!r}: expected ROWS[xSPLATS] with 2 to {bindings.TILE} ROWS and 1 or 2 SPLATS"
             )
         shapes[entry.strip()] = shape
     return shapes

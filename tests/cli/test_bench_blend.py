@@ -32,7 +32,7 @@ def test_it_needs_a_gpu() -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("shapes", ["8", "8x8x3", "8x8x4", "16x4", "4x32", "8xax2", "²x8x2", "8x8x1x2"])
+@pytest.mark.parametrize("shapes", ["1", "8x3", "8x4", "32", "axa", "²x2", "8x1x2"])
 def test_shapes_that_our_kernels_lack_are_refused(shapes: str) -> None:
     from lapgs_plugin.evaluation.bench_blend import parse_shapes
 
@@ -45,7 +45,5 @@ def test_shapes() -> None:
     from lapgs_plugin.evaluation.bench_blend import parse_shapes
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import SHAPE, Shape
 
-    assert list(parse_shapes("8x4, 4x8x1").values()) == [Shape(8, 4), Shape(4, 8, 1)]
+    assert list(parse_shapes("8, 4x1").values()) == [Shape(8), Shape(4, 1)]
     assert list(parse_shapes(None).values()) == [SHAPE]
-    with pytest.raises(UserInputError, match="at most 32 regions in a tile, not 64; make LANES or ROWS larger"):
-        parse_shapes("4x1")

@@ -28,6 +28,9 @@ from lapgs_plugin.rasterizers.gsplat.bindings import TILE
 from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
 
 WARP = 32
+COLUMNS = 4
+LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
+"""A warp's threads: this many columns of pixels by this many Gaussians."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
@@ -43,27 +46,20 @@ NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
 
 
 class Shape(NamedTuple):
-    """Lay out a warp's region and its bucket of Gaussians in its threads; all are powers of 2.
+    """Lay out a warp's region and its bucket of Gaussians in its threads; both are powers of 2.
 
     Attributes:
-        lanes: threads side by side, one for each column of the region, 4 or 8; the others hold other Gaussians.
-        rows: of the region, in the registers of a thread.
+        rows: of the region, which has `COLUMNS` columns; they are in the registers of a thread.
         splats: Gaussians in the registers of a thread, 1 or 2.
     """
 
-    lanes: int = 4
     rows: int = 4
     splats: int = 2
 
     @property
     def regions(self) -> int:
         """Number of regions in a tile."""
-        return (TILE // self.lanes) * (TILE // self.rows)
-
-    @property
-    def bucket(self) -> int:
-        """Number of Gaussians that a warp blends at once."""
-        return WARP // self.lanes * self.splats
+        return (TILE // COLUMNS) * (TILE // self.rows)
 
 
 SHAPE = Shape()
@@ -107,20 +103,19 @@ def _load_four(start: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr, lanes: tl.constexpr) -> tl.tensor:
+def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
     """Return, in each thread, `x` of the thread whose index along `axis`, 0 or 1, differs in one bit.
 
-    The index along axis 1 is a thread's number divided by `lanes`, that along axis 0 the remainder. Triton gives
+    The index along axis 1 is a thread's number divided by `LANES`, that along axis 0 the remainder. Triton gives
     threads to axes in that order, because it finds no order in the addresses of Gaussians.
     """
     if INTERPRETED:
-        size: tl.constexpr = x.shape[axis]
+        size: tl.constexpr = LANES if axis == 0 else SPLAT_LANES
+        others = tl.arange(0, size)[:, None] == (tl.arange(0, size) ^ bit)[None, :]
         if axis == 0:
-            other = tl.arange(0, size)[:, None] == (tl.arange(0, size) ^ bit)[None, :]
-            return tl.sum(tl.where(other[:, :, None, None, None], x[None], 0.0), 1)
-        other = tl.arange(0, size)[:, None] == (tl.arange(0, size) ^ bit)[None, :]
-        return tl.sum(tl.where(other[None, :, :, None, None], x[:, None], 0.0), 2)
-    step: tl.constexpr = bit if axis == 0 else bit * lanes
+            return tl.sum(tl.where(others[:, :, None, None, None], x[None], 0.0), 1)
+        return tl.sum(tl.where(others[None, :, :, None, None], x[:, None], 0.0), 2)
+    step: tl.constexpr = bit if axis == 0 else bit * LANES
     return tl.inline_asm_elementwise(
         "shfl.sync.bfly.b32 $0, $1, $2, 0x1f, 0xffffffff;", "=f,f,r", [x, step], tl.float32, False, 1
     )
@@ -150,39 +145,39 @@ def _count_bits(x: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _product_before(x: tl.tensor, lanes: tl.constexpr) -> tuple[tl.tensor, tl.tensor]:
+def _product_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
     """Return the product of `x` over the Gaussians before each along axis 1, and over all."""
-    index = tl.arange(0, x.shape[1])[None, :, None, None]
+    index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
     before = tl.zeros_like(x) + 1.0
     for i in tl.static_range(5):
-        if (1 << i) < x.shape[1]:
-            other = _swapped(x, 1, 1 << i, lanes)
+        if (1 << i) < SPLAT_LANES:
+            other = _swapped(x, 1, 1 << i)
             before = tl.where(index & (1 << i) != 0, before * other, before)
             x *= other
     return before, x
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _sum_before(x: tl.tensor, lanes: tl.constexpr) -> tuple[tl.tensor, tl.tensor]:
+def _sum_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
     """Return the sum of `x` over the Gaussians before each along axis 1, and over all."""
-    index = tl.arange(0, x.shape[1])[None, :, None, None]
+    index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
     before = tl.zeros_like(x)
     for i in tl.static_range(5):
-        if (1 << i) < x.shape[1]:
-            other = _swapped(x, 1, 1 << i, lanes)
+        if (1 << i) < SPLAT_LANES:
+            other = _swapped(x, 1, 1 << i)
             before = tl.where(index & (1 << i) != 0, before + other, before)
             x += other
     return before, x
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr, lanes: tl.constexpr) -> tl.tensor:
+def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr) -> tl.tensor:
     """Add up two threads' values along axis 0: those of `one` in the thread without the bit, of `other` in that with.
 
-    Tensors have the axes (lanes, splat_lanes, splats, 1).
+    Tensors have the axes (LANES, SPLAT_LANES, splats, 1).
     """
-    has = (tl.arange(0, lanes) & bit != 0)[:, None, None, None]
-    return tl.where(has, other, one) + _swapped(tl.where(has, one, other), 0, bit, lanes)
+    has = (tl.arange(0, LANES) & bit != 0)[:, None, None, None]
+    return tl.where(has, other, one) + _swapped(tl.where(has, one, other), 0, bit)
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -207,14 +202,14 @@ def _reaches(
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _region(
-    across: int, tiles: int, lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr
+    across: int, tiles: int, rows: tl.constexpr, tile: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:
     """Return the program's tile over all images, its image, and the first row and column of its region."""
     region = tl.program_id(0)
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
     index = region // regions
-    row = (index % tiles) // across * tile + region % regions // (tile // lanes) * rows
-    column = (index % tiles) % across * tile + region % (tile // lanes) * lanes
+    row = (index % tiles) // across * tile + region % regions // (tile // LANES) * rows
+    column = (index % tiles) % across * tile + region % (tile // LANES) * LANES
     return index, index // tiles, row, column
 
 
@@ -222,12 +217,12 @@ def _region(
 def _reach_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, threads: tl.constexpr,
+    columns: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, threads: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write which of the tile's pairs reach each of its regions, a bit for each pair."""
     index = tl.program_id(0)
     row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
+    regions: tl.constexpr = (tile // columns) * (tile // rows)
     begin = tl.load(offsets + index)
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
     block = _first_word(index, begin, regions)
@@ -240,8 +235,8 @@ def _reach_kernel(
         x, y = x - (column + 0.5), y - (row + 0.5)
         word = tl.zeros((threads,), tl.int32)  # of the region that has a thread's number in its warp
         for region in tl.static_range(regions):
-            left, top = region % (tile // lanes) * lanes, region // (tile // lanes) * rows
-            reaches = there & _reaches(x - left, y - top, a, b, c, opacity, lanes, rows)
+            left, top = region % (tile // columns) * columns, region // (tile // columns) * rows
+            reaches = there & _reaches(x - left, y - top, a, b, c, opacity, columns, rows)
             word = tl.where(thread % 32 == region, _ballot(reaches), word)
         wanted = (thread % 32 < regions) & (begin + thread // 32 * 32 < stop)
         tl.store(words + block + thread // 32 * regions + thread % 32, word, wanted)
@@ -299,16 +294,15 @@ def _fill(
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _bucket(
     queue: tl.tensor, head: tl.tensor, tail: tl.tensor, another: tl.tensor, records: tl.tensor,
-    lanes: tl.constexpr, splats: tl.constexpr, record: tl.constexpr,
+    splats: tl.constexpr, record: tl.constexpr,
 ) -> tuple[tl.tensor, ...]:  # fmt: skip
     """Load the queue's next bucket: the Gaussians, whether they are there, and x, y, a, b, c, opacity and colours.
 
     Those that are not there have the numbers of the last Gaussian, or of `another`, which are finite.
     """
-    splat_lanes: tl.constexpr = 32 // lanes
     # Which Gaussian of a bucket an element is; those in one thread are consecutive.
-    order = tl.arange(0, splat_lanes)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
-    order = tl.broadcast_to(order, (lanes, splat_lanes, splats, 1)) + head
+    order = tl.arange(0, SPLAT_LANES)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
+    order = tl.broadcast_to(order, (LANES, SPLAT_LANES, splats, 1)) + head
     gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & 127), tail > 0, another)
     x, y, a, b = _load_four(records + record * gaussian)
     c, opacity, _, _ = _load_four(records + record * gaussian + 4)
@@ -329,15 +323,13 @@ def _alphas(
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _transmittances(
-    alpha: tl.tensor, transmittance: tl.tensor, lanes: tl.constexpr
-) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
+def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
     """Return the transmittances before and after each Gaussian, and after the bucket."""
     left = 1.0 - alpha
     second = tl.arange(0, alpha.shape[2])[None, None, :, None] == 1  # of a thread's Gaussians
     by_both = tl.reduce(left, 2, _multiply, keep_dims=True)
     by_first = tl.reduce(tl.where(second, 1.0, left), 2, _multiply, keep_dims=True)
-    before, by_all = _product_before(by_both, lanes)
+    before, by_all = _product_before(by_both)
     before *= transmittance
     after = before * tl.where(second, by_both, by_first)
     return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
@@ -348,15 +340,14 @@ def _forward_kernel(
     records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
+    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
-    splat_lanes: tl.constexpr = 32 // lanes
-    bucket: tl.constexpr = splats * splat_lanes
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
-    index, image, row, column = _region(across, tiles, lanes, rows, tile)
-    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
-    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    bucket: tl.constexpr = splats * SPLAT_LANES
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
+    index, image, row, column = _region(across, tiles, rows, tile)
+    along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
     transmittance = tl.where(inside, 1.0, 0.0)
     # Sums over the Gaussians of each thread.
@@ -373,7 +364,7 @@ def _forward_kernel(
         queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
     )
     _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
-        queue, head, tail, another, records, lanes, splats, record
+        queue, head, tail, another, records, splats, record
     )
     while head < tail:
         # The next bucket is loaded before this one is blended, because loading takes as long.
@@ -381,9 +372,9 @@ def _forward_kernel(
         begin, words, tail, gaussians, word = _fill(
             queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
         )
-        following = _bucket(queue, head, tail, another, records, lanes, splats, record)
+        following = _bucket(queue, head, tail, another, records, splats, record)
         alpha = _alphas(x - (column + 0.5 + along), y - (row + 0.5 + down), a, b, c, opacity, there)
-        before, after, transmittance = _transmittances(alpha, transmittance, lanes)
+        before, after, transmittance = _transmittances(alpha, transmittance)
         weight = tl.where(after > LEAST, alpha * before, 0.0)
         red += tl.sum(weight * color_r, 2, keep_dims=True)
         green += tl.sum(weight * color_g, 2, keep_dims=True)
@@ -407,7 +398,7 @@ def _add_gradients(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
     gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
-    lanes: tl.constexpr, absolute: tl.constexpr,
+    absolute: tl.constexpr,
 ) -> None:  # fmt: skip
     """Add a bucket's gradients, summed over pixels, to those of all tiles.
 
@@ -419,20 +410,16 @@ def _add_gradients(
     red, green = tl.sum(by_red, 3, keep_dims=True), tl.sum(by_green, 3, keep_dims=True)
     blue, faint = tl.sum(by_blue, 3, keep_dims=True), -plain * _inverse(opacity)
     # Sums over columns: threads share out eight values, instead of each adding up all of them.
-    half: tl.constexpr = lanes // 2
-    of_red = _sum_of_pair(red, a * by_x + b * by_y, half, lanes)
-    of_green = _sum_of_pair(green, b * by_x + c * by_y, half, lanes)
-    of_blue = _sum_of_pair(blue, 0.5 * by_x * x, half, lanes)
-    of_opacity = _sum_of_pair(faint, by_y * x, half, lanes)
-    first = _sum_of_pair(of_red, of_blue, half // 2, lanes)
-    second = _sum_of_pair(of_green, of_opacity, half // 2, lanes)
-    lane = tl.arange(0, lanes)[:, None, None, None]
+    of_red = _sum_of_pair(red, a * by_x + b * by_y, 2)
+    of_green = _sum_of_pair(green, b * by_x + c * by_y, 2)
+    of_blue = _sum_of_pair(blue, 0.5 * by_x * x, 2)
+    of_opacity = _sum_of_pair(faint, by_y * x, 2)
+    first = _sum_of_pair(of_red, of_blue, 1)
+    second = _sum_of_pair(of_green, of_opacity, 1)
+    lane = tl.arange(0, LANES)[:, None, None, None]
     start = gradients + 8 * gaussian
-    if lanes == 8:
-        tl.atomic_add(start + lane, _sum_of_pair(first, second, 1, lanes), there, sem="relaxed")
-    else:
-        tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
-        tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
+    tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
+    tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
     value = tl.sum(0.5 * by_yy, 0, keep_dims=True)
     if absolute:
         along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3, keep_dims=True), 0, keep_dims=True)
@@ -449,18 +436,17 @@ def _backward_kernel(
     counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
     gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
+    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
     absolute: tl.constexpr,
 ) -> None:  # fmt: skip
-    # Tensors have the axes (lanes, splat_lanes, splats, rows). Triton spreads the first axes over threads, because it
+    # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
     # products over splats need no shuffles.
-    splat_lanes: tl.constexpr = 32 // lanes
-    bucket: tl.constexpr = splats * splat_lanes
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
-    index, image, row, column = _region(across, tiles, lanes, rows, tile)
-    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
-    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    bucket: tl.constexpr = splats * SPLAT_LANES
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
+    index, image, row, column = _region(across, tiles, rows, tile)
+    along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
     pixel = 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
     red = tl.load(by_images + pixel, inside, 0.0)
@@ -482,27 +468,27 @@ def _backward_kernel(
             queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
         )
         gaussian, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
-            queue, head, tail, another, records, lanes, splats, record
+            queue, head, tail, another, records, splats, record
         )
         head += bucket
-        x = x - (column + 0.5 + along)  # (lanes, splat_lanes, splats, 1)
-        y = y - (row + 0.5 + down)  # (lanes, splat_lanes, splats, rows)
+        x = x - (column + 0.5 + along)  # (LANES, SPLAT_LANES, splats, 1)
+        y = y - (row + 0.5 + down)  # (LANES, SPLAT_LANES, splats, rows)
         alpha = _alphas(x, y, a, b, c, opacity, there)
         inverse = _inverse(1.0 - alpha)
-        before, after, transmittance = _transmittances(alpha, transmittance, lanes)
+        before, after, transmittance = _transmittances(alpha, transmittance)
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
         weight = alpha * before
         added = weight * (color_r * red + color_g * green + color_b * blue)
         by_both = tl.sum(added, 2, keep_dims=True)
         by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
-        added_before, by_all = _sum_before(by_both, lanes)
+        added_before, by_all = _sum_before(by_both)
         still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
         behind -= by_all
         # The gradient by alpha, times -alpha.
         by_sigma = tl.where(alpha < OPAQUEST, still_behind * (alpha * inverse) - added, 0.0)
         _add_gradients(
             x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue,
-            gaussian, there, gradients, others, lanes, absolute,
+            gaussian, there, gradients, others, absolute,
         )  # fmt: skip
 
 
@@ -542,14 +528,14 @@ def blend_forward(
     words = flat.new_empty((len(flat) // WARP + offsets.numel()) * shape.regions)
     _reach_kernel[(offsets.numel(),)](
         records, offsets, flat, words, *numbers[2:],
-        lanes=shape.lanes, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
+        columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
         num_warps=REACH_WARPS, **FUSED,
     )  # fmt: skip
     images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
         records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 4 * WARP),
-        *numbers, lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
+        *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
     )  # fmt: skip
     return images, counts, words
@@ -582,7 +568,7 @@ def blend_backward(
     _backward_kernel[(programs,)](
         records, offsets, flat, words, counts, images, by_images, found, others,
         flat.new_empty(programs, 4 * WARP), *numbers,
-        lanes=shape.lanes, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
+        rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
     )  # fmt: skip
     leading = records.shape[:-1]

@@ -36,7 +36,6 @@ class Intermediates(NamedTuple):
     given: ToBlend
     blended: Blended
     radii: Tensor  # (c, n, 2)
-    depths: Tensor  # (c, n)
     scales: Tensor  # (n, 3)
     visible_radii: Tensor  # (c, n) the larger of both, 0 where culled
     centres: Tensor  # (c, n, 2) as in `RenderResult.means2d`
@@ -147,7 +146,7 @@ class _Render(torch.autograd.Function):
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
             compiled.CameraModelType.PINHOLE, found.radii, given.conics, None,
-            by_means2d, bindings.zeros(found.depths.shape, means.device), by_conics, None, False,
+            by_means2d, bindings.zeros(found.radii.shape[:2], means.device), by_conics, None, False,
         )  # fmt: skip
         by_sh, by_logits = finish_gradients(
             means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities[0],
@@ -170,14 +169,15 @@ def forward(
     size, count = (cameras.width, cameras.height), len(cameras.poses)
     scales, opacities = activate(log_scales, logits)
     projected = bindings.project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
-    radii, means2d, depths, conics = projected
+    radii, means2d, _, conics = projected
     colors, visible_radii, centres, records = visible_colors(
         means, cameras.centres, sh, degree, signed, radii, describes, (means2d, conics, opacities), ours
     )
     opacities = _for_each_camera(opacities, 1 if ours else count)
     tiles = bindings.sort_into_tiles(projected, size, count)
+    means2d = records[..., :2] if ours else means2d  # whatever is kept for the backward pass takes memory
     given = ToBlend(means2d, conics, colors, opacities, background, *tiles, records)
-    return Intermediates(given, blend(given, size), radii, depths, scales, visible_radii, centres)
+    return Intermediates(given, blend(given, size), radii, scales, visible_radii, centres)
 
 
 def _for_each_camera(values: Tensor, cameras: int) -> Tensor:
