@@ -124,12 +124,15 @@ close(counts, expected[1])
 
 from lapgs_plugin.rasterizers.gsplat.self_check import stacking_works
 from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss
+from lapgs_plugin.ops import position_noise, regularization
 torch.set_default_device(None)
 assert stacking_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 1e-5
+assert position_noise.triton_works.difference(torch.device(DEVICE)) < 1e-5
+assert regularization.triton_works.difference(torch.device(DEVICE)) < 1e-5
 """
 
 
