@@ -409,7 +409,8 @@ def _add_gradients(
     by_yy, by_x = tl.sum(by_sigma * y * y, 3, keep_dims=True), plain * x
     red, green = tl.sum(by_red, 3, keep_dims=True), tl.sum(by_green, 3, keep_dims=True)
     blue, faint = tl.sum(by_blue, 3, keep_dims=True), -plain * _inverse(opacity)
-    # Sums over columns: threads share out eight values, instead of each adding up all of them.
+    # Sums over columns: a thread's pair keeps four of eight values each, and of these two, instead of all in every thread.
+    # What is left in the thread of column i are the numbers 2 i and 2 i + 1 of a Gaussian's `GRADIENT` ones.
     of_red = _sum_of_pair(red, a * by_x + b * by_y, 2)
     of_green = _sum_of_pair(green, b * by_x + c * by_y, 2)
     of_blue = _sum_of_pair(blue, 0.5 * by_x * x, 2)
@@ -441,7 +442,7 @@ def _backward_kernel(
 ) -> None:  # fmt: skip
     # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
-    # products over splats need no shuffles.
+    # products over splats need no shuffles. `_swapped` relies on it; a layout of another release fails the self-check.
     bucket: tl.constexpr = splats * SPLAT_LANES
     regions: tl.constexpr = (tile // LANES) * (tile // rows)
     index, image, row, column = _region(across, tiles, rows, tile)
