@@ -409,7 +409,7 @@ def _add_gradients(
     by_yy, by_x = tl.sum(by_sigma * y * y, 3, keep_dims=True), plain * x
     red, green = tl.sum(by_red, 3, keep_dims=True), tl.sum(by_green, 3, keep_dims=True)
     blue, faint = tl.sum(by_blue, 3, keep_dims=True), -plain * _inverse(opacity)
-    # Sums over columns: of a pair of threads each keeps four of eight values, and then two, instead of all in every one.
+    # Sums over columns: of a pair of threads each keeps four of eight values, and then two, instead of all in each.
     # What is left in the thread of column i are the numbers 2 i and 2 i + 1 of a Gaussian's `GRADIENT` ones.
     of_red = _sum_of_pair(red, a * by_x + b * by_y, 2)
     of_green = _sum_of_pair(green, b * by_x + c * by_y, 2)
