@@ -234,31 +234,36 @@ class Finishing:
 
     @staticmethod
     def visible_colors(
-        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, describes: bool,
+        splats: tuple[Tensor, Tensor, Tensor], packs: bool,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+        assert not packs, "records are for our kernels that blend, which need a GPU"
         shown = (radii > 0).all(-1)  # (c, n)
         values = torch.stack(
             [sh_to_color(sh, torch.nn.functional.normalize(means - c, dim=-1), degree, signed=signed) for c in centre]
         )
         colors = torch.where(shown[..., None], values, 0.0)
-        if pixels is None:
-            return colors, radii.new_empty(len(radii), 0), means.new_empty(len(radii), 0, 2)
+        none = means.new_empty(0)
+        if not describes:
+            return colors, radii.new_empty(len(radii), 0), means.new_empty(len(radii), 0, 2), none
         largest = torch.where(shown, radii.amax(-1), 0)
-        return colors, largest, torch.where(shown[..., None], pixels - 0.5, 0.0)
+        return colors, largest, torch.where(shown[..., None], splats[0] - 0.5, 0.0), none
 
     @staticmethod
     def finish_gradients(
         means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
         scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
-    ) -> Tensor:  # fmt: skip
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         with torch.enable_grad():
             leaves = means.detach().clone().requires_grad_(), sh.detach().clone().requires_grad_()
-            values, *_ = Finishing.visible_colors(leaves[0], centre, leaves[1], degree, signed, radii, None)
+            none = means.new_empty(0)
+            values, *_ = Finishing.visible_colors(
+                leaves[0], centre, leaves[1], degree, signed, radii, False, (none, none, none), False
+            )
             by_direction, by_sh = torch.autograd.grad((values * by_color).sum(), leaves, allow_unused=True)
         by_mean += 0.0 if by_direction is None else by_direction
         by_scale *= scales
-        by_opacity[0] = by_opacity.sum(0) * (opacities * (1 - opacities)).view(-1, len(means))[0]
-        return by_sh
+        return by_sh, by_opacity.sum(0) * opacities * (1 - opacities)
 
 
 @contextmanager

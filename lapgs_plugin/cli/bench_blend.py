@@ -25,9 +25,8 @@ def blend(
     shapes: Annotated[
         str | None,
         typer.Option(
-            metavar="LANESxROWSxSPLAT_LANESxSPLATS[xWARPS[xBATCH]][+ahead],...",
-            help="Shapes of our kernel to time; +ahead finds the regions that each Gaussian reaches in a launch of its "
-            "own. Default: the one that training uses.",
+            metavar="ROWS[xSPLATS],...",
+            help="Shapes of our kernel to time. Default: the one that training uses.",
         ),
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Turns; the table has medians over them.")] = 7,

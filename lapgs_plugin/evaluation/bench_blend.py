@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -23,9 +23,6 @@ from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape
-
-AHEAD = "+ahead"
-"""Suffix of a shape that looks `ahead`."""
 
 
 @dataclass(frozen=True)
@@ -52,33 +49,24 @@ class Kernels(NamedTuple):
 
 
 def parse_shapes(text: str | None) -> dict[str, Shape]:
-    """Parse shapes such as "8x8x4x2,8x4x4x4x1+ahead", in the order of `blend_kernels.Shape`; None for the default one.
+    """Parse shapes such as "4x2,8x1", in the order of `blend_kernels.Shape`; None for the default one.
 
     Raises:
-        UserInputError: an entry is not 4 to 6 powers of 2, or does not fill a tile's regions and a warp's threads.
+        UserInputError: an entry is not one or two powers of 2, or has too many rows or Gaussians, or too few rows.
     """
-    from lapgs_plugin.rasterizers.gsplat import blend_kernels
+    from lapgs_plugin.rasterizers.gsplat import bindings, blend_kernels
 
     if text is None:
-        text = "x".join(map(str, blend_kernels.SHAPE[:-1])) + AHEAD * blend_kernels.SHAPE.ahead
+        text = "x".join(map(str, blend_kernels.SHAPE))
     shapes = {}
     for entry in text.split(","):
-        plain = entry.strip().removesuffix(AHEAD)
-        numbers: list[Any] = [int(number) if number.isdecimal() else 0 for number in plain.split("x")]
-        if not 4 <= len(numbers) <= 6 or any(number < 1 or number & (number - 1) for number in numbers):
-            raise UserInputError(f"--shapes {entry!r}: expected 4 to 6 powers of 2 such as 8x8x4x2")
-        shape = blend_kernels.Shape(*numbers)._replace(ahead=plain != entry.strip())
-        fills_warps = shape.lanes * shape.splat_lanes == 32 * shape.warps
-        bucket = shape.splat_lanes * shape.splats
-        if max(shape.lanes, shape.rows) > blend_kernels.TILE or not fills_warps or shape.batch < max(bucket, 32):
+        numbers = [int(number) if number.isdecimal() else 0 for number in entry.strip().split("x")]
+        if not 1 <= len(numbers) <= 2 or any(number < 1 or number & (number - 1) for number in numbers):
+            raise UserInputError(f"--shapes {entry!r}: expected one or two powers of 2 such as 4x2")
+        shape = blend_kernels.Shape(*numbers)
+        if not 2 <= shape.rows <= bindings.TILE or shape.splats > 2:
             raise UserInputError(
-                f"--shapes {entry!r}: expected LANESxROWSxSPLAT_LANESxSPLATS[xWARPS[xBATCH]] with LANES and ROWS up to "
-                f"{blend_kernels.TILE}, LANES times SPLAT_LANES = 32 times WARPS, and BATCH at least 32 and the bucket"
-            )
-        if shape.ahead and shape.regions > blend_kernels.MOST_REGIONS:
-            raise UserInputError(
-                f"--shapes {entry!r}: expected at most {blend_kernels.MOST_REGIONS} regions in a tile, not "
-                f"{shape.regions}; make LANES or ROWS larger, or leave {AHEAD} out"
+                f"--shapes {entry!r}: expected ROWS[xSPLATS] with 2 to {bindings.TILE} ROWS and 1 or 2 SPLATS"
             )
         shapes[entry.strip()] = shape
     return shapes
@@ -122,19 +110,22 @@ def contenders(given: ToBlend, size: tuple[int, int], shapes: Mapping[str, Shape
     """Return gsplat's kernels, and ours in several shapes."""
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
 
+    # In training, the kernel that computes colours writes them.
+    records = blend_gradients.records_of(given.means2d, given.conics, given.colors, given.opacities)
+
     def ours(shape: Shape) -> Kernels:
         def forward() -> Blended:
-            images, *rest = blend_forward(*given, size, shape)
+            images, *rest = blend_forward(records, given.background, given.offsets, given.flat, size, shape)
             return Blended(images, images.new_empty(0), *rest)
 
         def backward(blended: Blended, by_images: Tensor) -> Gradients:
-            rest = given.offsets, given.flat, blended.images, blended.last, blended.reached, by_images
-            return blend_backward(*given[:4], *rest, False, shape)
+            rest = given.offsets, given.flat, blended.images, blended.last, blended.words, by_images
+            return blend_backward(records, *rest, False, shape)
 
         return Kernels(forward, backward)
 
     gsplat = Kernels(
-        partial(blend_gradients.blend, given, size, ours=False),
+        partial(blend_gradients.blend, given, size),
         partial(blend_gradients.gradients, given, absolute=False),
     )
     return {"gsplat": gsplat, **{name: ours(shape) for name, shape in shapes.items()}}

@@ -15,12 +15,22 @@ from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.jit.threads import one_pool
-from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss, upsample
+from lapgs_plugin.ops import (
+    adam,
+    color_transform,
+    densification_statistics,
+    photometric_loss,
+    position_noise,
+    regularization,
+    upsample,
+)
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
+from lapgs_plugin.ops.position_noise.in_torch import displacements
+from lapgs_plugin.ops.regularization.in_torch import regularization_torch
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
@@ -72,6 +82,8 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
         "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
         "Adam": _adam_versions(ours, gaussians, device),
         "densification statistics": _statistics_versions(ours, gaussians, device),
+        "regularization": _regularization_versions(gaussians, device),
+        "position noise": _noise_versions(gaussians, device),
         "colour transform": _transform_versions(images[0]),
     }
     return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
@@ -219,4 +231,39 @@ def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Ver
     versions = {TORCH: version(add_statistics_torch)}
     if ours != NUMBA and densification_statistics.triton_works():
         versions[ours] = version(densification_statistics.add_statistics)
+    return versions
+
+
+def _regularization_versions(gaussians: int, device: torch.device) -> Versions:
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(gaussians, generator=generator).to(device).requires_grad_()
+    log_scales = torch.randn(gaussians, 3, generator=generator).to(device).requires_grad_()
+
+    def version(compute: Callable[[Tensor, Tensor, float, float], Tensor]) -> Version:
+        return Version(lambda: torch.autograd.grad(compute(logits, log_scales, 1.0, 1.0), (logits, log_scales))[1])
+
+    versions = {TORCH: version(regularization_torch)}
+    if regularization.triton_works(logits):
+        versions["Triton"] = version(regularization.regularization)
+    return versions
+
+
+def _noise_versions(gaussians: int, device: torch.device) -> Versions:
+    generator = torch.Generator().manual_seed(0)
+    columns = (4,), (3,), (), (3,)
+    given = [torch.randn(gaussians, *each, generator=generator).to(device) for each in columns]
+
+    def moved(means: Tensor) -> None:
+        means += displacements(given[0], given[1], given[2], given[3], 1e-3)
+
+    def moved_in_one(means: Tensor) -> None:
+        position_noise.add_noise(means, given[0], given[1], given[2], given[3], 1e-3)
+
+    def version(move: Callable[[Tensor], None]) -> Version:
+        means = torch.zeros(gaussians, 3, device=device)
+        return Version(lambda: move(means), means)
+
+    versions = {TORCH: version(moved)}
+    if position_noise.triton_works(given[0]):
+        versions["Triton"] = version(moved_in_one)
     return versions

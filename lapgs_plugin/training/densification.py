@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
@@ -15,6 +14,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.densification_statistics import add_statistics
+from lapgs_plugin.ops.regularization import regularization
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Gradients, Strategy
@@ -92,12 +92,9 @@ class DensityControl:
 
     def regularization(self, field: GaussianField) -> Tensor | None:
         """Return a term of the loss that makes unneeded Gaussians transparent and small; None if its weights are 0."""
-        terms = []
-        if self._opacity_weight:
-            terms.append(self._opacity_weight * torch.sigmoid(field.opacity_logits).mean())
-        if self._scale_weight:
-            terms.append(self._scale_weight * torch.exp(field.log_scales).mean())
-        return sum(terms[1:], terms[0]) if terms else None
+        if not (self._opacity_weight or self._scale_weight):
+            return None
+        return regularization(field.opacity_logits, field.log_scales, self._opacity_weight, self._scale_weight)
 
 
 def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> DensityControl:

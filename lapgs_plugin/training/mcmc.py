@@ -15,6 +15,8 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.ops.position_noise import add_noise
+from lapgs_plugin.ops.position_noise.in_torch import displacements
 from lapgs_plugin.training.densification import DensityControl, ViewScores
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
@@ -34,8 +36,6 @@ for. After each single view it would take a CPU a fifth of the training time."""
 GROWTH, GROWTH_OF_STAGE, MOST_GROWTH = 1.05, 350.0, 1.5
 """Factor on the number of Gaussians each time that some are added: MCMC's, or more in short stages, so that they grow
 as much as the stages of a run of 30,000 iterations."""
-SHARPNESS, FAINT = 100.0, 0.005
-"""Noise falls with the opacity as the sigmoid SHARPNESS (FAINT - opacity)."""
 SOLID = 0.1
 """Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
 
@@ -159,20 +159,11 @@ def shake(model: TrainableField, amount: float) -> None:
         model: edited in place.
         amount: factor on the covariance, times which a standard normal vector is added to a transparent Gaussian.
     """
-    means, opacities = model.params["means"], torch.sigmoid(model.params["opacities"])
-    rows: Tensor | slice = slice(None)
-    if means.device.type == "cpu":  # a GPU would wait for the number of rows
-        rows = (opacities < SOLID).nonzero()[:, 0]
-    share = torch.sigmoid(SHARPNESS * (FAINT - opacities[rows]))
-    noise = torch.randn_like(means[rows]) * (amount * share)[:, None]
-    quats = model.params["quats"][rows]
-    means[rows] += _turned(quats, _turned(quats, noise, back=True) * torch.exp(2.0 * model.params["scales"][rows]))
-
-
-def _turned(quaternions: Tensor, vectors: Tensor, *, back: bool = False) -> Tensor:
-    """Rotate vectors (n, 3) by quaternions (n, 4), w first and of any length, or back; matrices would take three times
-    the memory."""
-    real, axis = quaternions[:, :1], quaternions[:, 1:]
-    across: Tensor = torch.linalg.cross(axis, vectors) * (2.0 / quaternions.square().sum(1, keepdim=True))
-    turned: Tensor = vectors + (-real if back else real) * across + torch.linalg.cross(axis, across)
-    return turned
+    means, quaternions = model.params["means"], model.params["quats"]
+    log_scales, logits = model.params["scales"], model.params["opacities"]
+    if means.device.type != "cpu":
+        add_noise(means, quaternions, log_scales, logits, torch.randn_like(means), amount)
+        return
+    rows = (torch.sigmoid(logits) < SOLID).nonzero()[:, 0]  # a GPU would wait for their number
+    noise = torch.randn(len(rows), 3, dtype=means.dtype)
+    means[rows] += displacements(quaternions[rows], log_scales[rows], logits[rows], noise, amount)

@@ -8,7 +8,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.ops import densification_statistics
+from lapgs_plugin.ops import densification_statistics, position_noise, regularization
 from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
@@ -45,4 +45,5 @@ def warm_up(
         photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
         model.step(0.0, 1, scale=StepScale.of(2))
     if on_gpu:
-        densification_statistics.triton_works()
+        for operation in (densification_statistics, position_noise, regularization):
+            operation.triton_works()

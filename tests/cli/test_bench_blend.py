@@ -32,8 +32,8 @@ def test_it_needs_a_gpu() -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("shapes", ["8x8", "8x8x4x3", "8x8x8x2", "32x4x1x4", "8xax4x2", "²x8x4x2"])
-def test_shapes_that_fill_no_warp_are_refused(shapes: str) -> None:
+@pytest.mark.parametrize("shapes", ["1", "8x3", "8x4", "32", "axa", "²x2", "8x1x2"])
+def test_shapes_that_our_kernels_lack_are_refused(shapes: str) -> None:
     from lapgs_plugin.evaluation.bench_blend import parse_shapes
 
     with pytest.raises(UserInputError, match=f"--shapes '{shapes}': expected"):
@@ -41,11 +41,9 @@ def test_shapes_that_fill_no_warp_are_refused(shapes: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-def test_shapes_that_look_ahead() -> None:
+def test_shapes() -> None:
     from lapgs_plugin.evaluation.bench_blend import parse_shapes
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import SHAPE, Shape
 
-    assert list(parse_shapes("8x4x4x2+ahead, 4x2x8x1").values()) == [Shape(ahead=True), Shape(4, 2, 8, 1)]
+    assert list(parse_shapes("8, 4x1").values()) == [Shape(8), Shape(4, 1)]
     assert list(parse_shapes(None).values()) == [SHAPE]
-    with pytest.raises(UserInputError, match="at most 32 regions in a tile, not 64; make LANES or ROWS larger"):
-        parse_shapes("2x2x16x2+ahead")

@@ -17,7 +17,8 @@ def test_every_version_gives_what_pytorch_gives() -> None:
     found = benchmark(torch.device("cpu"), 36, 24, 50, 1)
     versions = {(time.op, time.version): time.difference for time in found}
     assert {op for op, _ in versions} == {
-        "upsample", "photometric loss", "Adam", "densification statistics", "colour transform", "residual's loss"
+        "upsample", "photometric loss", "Adam", "densification statistics", "colour transform", "residual's loss",
+        "regularization", "position noise",
     }  # fmt: skip
     for op in ("upsample", "photometric loss", "Adam"):
         # Sums in other orders, of values of about 1; worst seen: 3e-6, of the loss's gradient.

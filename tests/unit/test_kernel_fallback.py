@@ -20,6 +20,8 @@ from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
+from lapgs_plugin.ops.position_noise import add_noise
+from lapgs_plugin.ops.regularization import regularization
 from lapgs_plugin.ops.self_check import SelfCheck
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rasterizers.gsplat import bindings
@@ -83,9 +85,25 @@ def upsampled() -> Pair:
     return upsample_add(Pyramid(), coarse, fine), Pyramid().up(coarse, (8, 10)) + fine
 
 
+def moved() -> Pair:
+    means, upright = torch.zeros(2, 3), torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.5, 0.5, 0.5, 0.5]])
+    log_scales, noise = torch.tensor([[0.0, -1.0, 1.0]]).repeat(2, 1), torch.tensor([[1.0, 2.0, 3.0]]).repeat(2, 1)
+    add_noise(means, upright, log_scales, torch.full((2,), -20.0), noise, 1.0)
+    # The second one is turned so that x becomes y, y z and z x.
+    variances = torch.exp(2 * torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0]]))
+    return means, noise * variances * torch.sigmoid(torch.tensor(0.5))
+
+
+def regularized() -> Pair:
+    term = regularization(torch.tensor([0.0, 0.0]), torch.zeros(2, 3), 0.3, 0.25)
+    return term, torch.tensor(0.3 * 0.5 + 0.25)
+
+
 @pytest.mark.parametrize(
     ("operation", "kernels", "compute", "instead"),
     [
+        ("position_noise", ("add_noise_triton",), moved, "noise of positions in several operations"),
+        ("regularization", ("regularization_triton",), regularized, "regularization in several operations"),
         ("photometric_loss", ("photometric_loss_triton",), loss, "the photometric loss in many operations"),
         ("densification_statistics", ("add_statistics_triton",), statistics, "densification statistics in several"),
         ("color_transform", ("transform_colors_triton",), colors, "colour transforms as products of matrices"),

@@ -12,6 +12,7 @@ import torch
 
 CHECKS = """
 import torch
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import records_of
 from lapgs_plugin.rasterizers.gsplat.kernels import activate, finish_gradients, visible_colors, write_to_stack
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.pyramid import Pyramid
@@ -38,22 +39,32 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     scales, opacities = activate(log_scales.detach(), logits.detach())
     close(scales, log_scales.exp())
     close(opacities, logits.sigmoid())
-    given = means.detach(), centre, sh.detach(), active, signed, radii
-    colors, largest, centres = visible_colors(*given, pixels)
+    given, conics = (means.detach(), centre, sh.detach(), active, signed, radii), torch.randn(cameras, n, 3)
+    splats = pixels, conics, opacities
+    colors, largest, centres, records = visible_colors(*given, True, splats, False)
     directions = [torch.nn.functional.normalize(means - each, dim=-1) for each in centre]
     seen = torch.stack([sh_to_color(sh, each, active, signed=signed) for each in directions])
     close(colors[shown], seen[shown])
     assert (largest == torch.where(shown, radii.amax(-1), 0)).all()
     close(centres, torch.where(shown[..., None], pixels - 0.5, 0.0))
-    assert visible_colors(*given, None)[1].numel() == 0
+    assert len(records) == 0
+    packed, largest, _, records = visible_colors(*given, False, splats, True)
+    assert largest.numel() == 0
+    close(packed[shown], colors[shown])
+    expected = records_of(pixels, conics, colors, opacities.expand(cameras, -1))
+    meant = [0, 1, 2, 3, 4, 5, 8, 9, 10]
+    close(records[shown][:, meant], expected[shown][:, meant])
     if active == degree and cameras == 1:
-        found = radii[0], pixels[0], torch.randn(n), torch.randn(n, 3)
-        placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in (*found, colors[0])]
-        write_to_stack(means.detach(), centre, sh.detach(), signed, found, placed, 30)
-        for part, whole in zip((*found, colors[0]), placed, strict=True):
-            close(whole[30 : 30 + n], part)  # two kernels, which may round the colours differently
-            assert (whole[:30] == -7).all()
-            assert (whole[30 + n :] == -7).all()
+        found = radii[0], pixels[0], torch.randn(n)
+        parts = *found, records[0]
+        placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in parts]
+        write_to_stack(means.detach(), centre, sh.detach(), opacities, signed, (*found, conics[0]), placed, 30)
+        assert all((whole[:30] == -7).all() and (whole[30 + n :] == -7).all() for whole in placed)
+        for part, whole in zip(found, placed[:3], strict=True):
+            close(whole[30 : 30 + n], part)
+        written = placed[3][30 : 30 + n]
+        close(written[shown[0]][:, meant], records[0][shown[0]][:, meant])  # two kernels, which may round differently
+        assert (written[~shown[0]] == -7).all()
 
     by_color = torch.randn(cameras, n, 3) * shown[..., None]
     by_mean, by_scale = (torch.randn(n, 3) * shown.any(0)[:, None] for _ in range(2))
@@ -61,9 +72,17 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     loss = (seen * by_color).sum() + (means * by_mean).sum()
     loss = loss + (log_scales.exp() * by_scale).sum() + (logits.sigmoid() * by_opacity).sum()
     expected = torch.autograd.grad(loss, (means, log_scales, logits, sh))
-    by_sh = finish_gradients(*given, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity)
-    for found, wanted in zip((by_mean, by_scale, by_opacity[0], by_sh), expected, strict=True):
-        close(found, wanted)
+    for views in (False, True):  # of memory that holds other numbers too
+        if views:
+            held = torch.randn(cameras, n, 8)
+            held[..., :3], held[..., 3] = by_color, by_opacity
+            by_color, by_opacity, colors = held[..., :3], held[..., 3], packed
+        by_mean_here, by_scale_here = by_mean.clone(), by_scale.clone()
+        by_sh, by_logit = finish_gradients(
+            *given, colors, scales, opacities, by_color, by_mean_here, by_scale_here, by_opacity
+        )
+        for found, wanted in zip((by_mean_here, by_scale_here, by_logit, by_sh), expected, strict=True):
+            close(found, wanted)
 
     if cameras == 3:
         norms, counts = torch.rand(n), torch.rand(n)
@@ -105,12 +124,15 @@ close(counts, expected[1])
 
 from lapgs_plugin.rasterizers.gsplat.self_check import stacking_works
 from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss
+from lapgs_plugin.ops import position_noise, regularization
 torch.set_default_device(None)
 assert stacking_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 1e-5
+assert position_noise.triton_works.difference(torch.device(DEVICE)) < 1e-5
+assert regularization.triton_works.difference(torch.device(DEVICE)) < 1e-5
 """
 
 

@@ -40,7 +40,8 @@ def sort_into_tiles(
     """Sort Gaussians into tiles, front to back. This waits for the GPU, for the number of pairs with tiles.
 
     Args:
-        projected: results of `project`; or, without the leading dimension, those of several images in one list.
+        projected: radii, centres and depths by `project`; or, without the leading dimension, those of several images
+            in one list.
         size: (width, height) of all images.
         count: number of images.
         of_image: in a list, the image number (n,) of each Gaussian.
@@ -49,7 +50,7 @@ def sort_into_tiles(
         The first pair of each tile, (count, tiles down, tiles across), and the Gaussian of each pair.
     """
     compiled = compiled_functions()
-    radii, means2d, depths, _ = projected
+    radii, means2d, depths = projected[:3]
     across, down = (math.ceil(side / TILE) for side in size)
     # gsplat also takes the index of each Gaussian, but does not use it.
     _, pairs, flat = compiled.intersect_tile(

@@ -1,9 +1,9 @@
-"""Blend and compute the gradients of blending in Triton, one program for each region of a tile.
+"""Blend and compute the gradients of blending in Triton, one warp for each region of a tile.
 
 gsplat gives each pixel a thread, which goes through all Gaussians of its tile. In the backward pass the threads of a
 warp add up their gradients for each Gaussian by shuffles, which takes most of the time. Here a warp holds a bucket of
-Gaussians by all pixels of its region: it skips Gaussians that do not reach the region, and it adds up pixels in
-registers first.
+Gaussians by all pixels of its region. A launch before finds which regions of its tile each Gaussian reaches, so that a
+region skips the others. What blending reads of a Gaussian lies together in memory, and so do its gradients.
 
 The backward pass too takes Gaussians front to back. Let g be a pixel's gradient, c_i the colours, a_i the
 alphas, T_i the transmittances before each Gaussian. The colour that reaches the eye from behind Gaussian i, with the
@@ -19,14 +19,18 @@ from __future__ import annotations
 import os
 from typing import NamedTuple
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.rasterizers.gsplat.bindings import TILE
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
 
-TILE = 16
+WARP = 32
+COLUMNS = 4
+LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
+"""A warp's threads: this many columns of pixels by this many Gaussians."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
@@ -34,43 +38,36 @@ LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
 INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
 
+GRADIENT = 8
+"""Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b."""
+
 # Kernels are not compiled anew for other sizes.
 NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
 
 
 class Shape(NamedTuple):
-    """Lay out a program's region and its bucket of Gaussians in the threads of its warps; all are powers of 2.
+    """Lay out a warp's region and its bucket of Gaussians in its threads; both are powers of 2.
 
     Attributes:
-        lanes: threads side by side, one for each column of the region.
-        rows: of the region, in the registers of a thread.
-        splat_lanes: threads that hold different Gaussians; `lanes * splat_lanes` is 32 times `warps`.
-        splats: Gaussians in the registers of a thread.
-        warps: of a program.
-        batch: pairs that a program tests at once for whether they reach its region; at least a bucket.
-        ahead: whether one launch before finds the regions that each pair reaches. Otherwise each region reads and tests
-            all Gaussians of its tile, in both passes.
+        rows: of the region, which has `COLUMNS` columns; they are in the registers of a thread.
+        splats: Gaussians in the registers of a thread, 1 or 2.
     """
 
-    lanes: int = 8
     rows: int = 4
-    splat_lanes: int = 4
     splats: int = 2
-    warps: int = 1
-    batch: int = 32
-    ahead: bool = False
 
     @property
     def regions(self) -> int:
         """Number of regions in a tile."""
-        return (TILE // self.lanes) * (TILE // self.rows)
+        return (TILE // COLUMNS) * (TILE // self.rows)
 
 
 SHAPE = Shape()
-MOST_REGIONS = 32
-"""Regions of a tile that the bits of a number can tell apart."""
-REACH_BATCH, REACH_WARPS = 128, 4
-"""Pairs that a program of the launch before tests at once, and its warps."""
+REACH_WARPS = 4
+"""Of a program of the launch before; each thread tests a pair at once."""
+SPLIT_BLOCK = 256
+FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
+"""At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -95,6 +92,95 @@ def _inverse(x: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _load_four(start: tl.tensor) -> tl.tensor:
+    """Load four numbers that begin at a multiple of 16 bytes; where compiled, in one instruction."""
+    if INTERPRETED:
+        return tl.load(start), tl.load(start + 1), tl.load(start + 2), tl.load(start + 3)
+    return tl.inline_asm_elementwise(
+        "ld.global.nc.v4.f32 {$0, $1, $2, $3}, [$4];", "=f,=f,=f,=f,l", [start],
+        (tl.float32, tl.float32, tl.float32, tl.float32), True, 1,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
+    """Return, in each thread, `x` of the thread whose index along `axis`, 0 or 1, differs in one bit.
+
+    The index along axis 1 is a thread's number divided by `LANES`, that along axis 0 the remainder. Triton gives
+    threads to axes in that order, because it finds no order in the addresses of Gaussians.
+    """
+    if INTERPRETED:
+        size: tl.constexpr = LANES if axis == 0 else SPLAT_LANES
+        others = tl.arange(0, size)[:, None] == (tl.arange(0, size) ^ bit)[None, :]
+        if axis == 0:
+            return tl.sum(tl.where(others[:, :, None, None, None], x[None], 0.0), 1)
+        return tl.sum(tl.where(others[None, :, :, None, None], x[:, None], 0.0), 2)
+    step: tl.constexpr = bit if axis == 0 else bit * LANES
+    return tl.inline_asm_elementwise(
+        "shfl.sync.bfly.b32 $0, $1, $2, 0x1f, 0xffffffff;", "=f,f,r", [x, step], tl.float32, False, 1
+    )
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _ballot(wanted: tl.tensor) -> tl.tensor:
+    """Return, in all threads of a warp, a bit for each of them; `wanted` is (threads,)."""
+    if INTERPRETED:
+        bits = tl.reshape(wanted.to(tl.int32) << (tl.arange(0, wanted.shape[0]) % 32), (wanted.shape[0] // 32, 32))
+        return tl.reshape(tl.broadcast_to(tl.sum(bits, 1)[:, None], bits.shape), wanted.shape)
+    return tl.inline_asm_elementwise(
+        "{ .reg .pred wanted; setp.ne.s32 wanted, $1, 0; vote.sync.ballot.b32 $0, wanted, 0xffffffff; }", "=r,r",
+        [wanted.to(tl.int32)], tl.int32, False, 1,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _count_bits(x: tl.tensor) -> tl.tensor:
+    """Return how many bits of each number are set."""
+    if INTERPRETED:
+        count = tl.zeros_like(x)
+        for i in tl.static_range(32):
+            count += (x >> i) & 1
+        return count
+    return tl.inline_asm_elementwise("popc.b32 $0, $1;", "=r,r", [x], tl.int32, True, 1)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _product_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
+    """Return the product of `x` over the Gaussians before each along axis 1, and over all."""
+    index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
+    before = tl.zeros_like(x) + 1.0
+    for i in tl.static_range(5):
+        if (1 << i) < SPLAT_LANES:
+            other = _swapped(x, 1, 1 << i)
+            before = tl.where(index & (1 << i) != 0, before * other, before)
+            x *= other
+    return before, x
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _sum_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
+    """Return the sum of `x` over the Gaussians before each along axis 1, and over all."""
+    index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
+    before = tl.zeros_like(x)
+    for i in tl.static_range(5):
+        if (1 << i) < SPLAT_LANES:
+            other = _swapped(x, 1, 1 << i)
+            before = tl.where(index & (1 << i) != 0, before + other, before)
+            x += other
+    return before, x
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr) -> tl.tensor:
+    """Add up two threads' values along axis 0: those of `one` in the thread without the bit, of `other` in that with.
+
+    Tensors have the axes (LANES, SPLAT_LANES, splats, 1).
+    """
+    has = (tl.arange(0, LANES) & bit != 0)[:, None, None, None]
+    return tl.where(has, other, one) + _swapped(tl.where(has, one, other), 0, bit)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _reaches(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     width: tl.constexpr, height: tl.constexpr,
@@ -115,115 +201,114 @@ def _reaches(
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _add_gradients(
-    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor,
-    by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
-    of_sums: tl.tensor, there_of_sums: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
-    by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
-    absolute: tl.constexpr,
-) -> None:  # fmt: skip
-    """Add a bucket's gradients, summed over pixels, to those of all tiles.
-
-    `x` and `y` are a Gaussian's centre less a pixel's, `by_sigma` the gradient by half its squared distance.
-    """
-    if absolute:
-        along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3), 0)
-        along_y = tl.sum(tl.sum(tl.abs(by_sigma * (b * x + c * y)), 3), 0)
-        tl.atomic_add(by_absolute + 2 * of_sums, along_x, there_of_sums, sem="relaxed")
-        tl.atomic_add(by_absolute + 2 * of_sums + 1, along_y, there_of_sums, sem="relaxed")
-    # Sums over rows, with axes (lanes, splat_lanes, splats); x is the same in all rows.
-    x = tl.sum(x, 3)
-    plain, by_y = tl.sum(by_sigma, 3), tl.sum(by_sigma * y, 3)
-    sum_x, sum_y, sum_xy = tl.sum(plain * x, 0), tl.sum(by_y, 0), tl.sum(by_y * x, 0)
-    sum_xx, sum_yy = tl.sum(plain * x * x, 0), tl.sum(tl.sum(by_sigma * y * y, 3), 0)
-    a, b, c = tl.load(conics + 3 * of_sums), tl.load(conics + 3 * of_sums + 1), tl.load(conics + 3 * of_sums + 2)
-    tl.atomic_add(by_means2d + 2 * of_sums, a * sum_x + b * sum_y, there_of_sums, sem="relaxed")
-    tl.atomic_add(by_means2d + 2 * of_sums + 1, b * sum_x + c * sum_y, there_of_sums, sem="relaxed")
-    tl.atomic_add(by_conics + 3 * of_sums, 0.5 * sum_xx, there_of_sums, sem="relaxed")
-    tl.atomic_add(by_conics + 3 * of_sums + 1, sum_xy, there_of_sums, sem="relaxed")
-    tl.atomic_add(by_conics + 3 * of_sums + 2, 0.5 * sum_yy, there_of_sums, sem="relaxed")
-    by_opacity = -tl.sum(plain, 0) / tl.load(opacities + of_sums)
-    tl.atomic_add(by_opacities + of_sums, by_opacity, there_of_sums, sem="relaxed")
-    tl.atomic_add(by_colors + 3 * of_sums, tl.sum(tl.sum(by_red, 3), 0), there_of_sums, sem="relaxed")
-    tl.atomic_add(by_colors + 3 * of_sums + 1, tl.sum(tl.sum(by_green, 3), 0), there_of_sums, sem="relaxed")
-    tl.atomic_add(by_colors + 3 * of_sums + 2, tl.sum(tl.sum(by_blue, 3), 0), there_of_sums, sem="relaxed")
-
-
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _region(
-    across: int, tiles: int, lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr
+    across: int, tiles: int, rows: tl.constexpr, tile: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:
     """Return the program's tile over all images, its image, and the first row and column of its region."""
     region = tl.program_id(0)
-    regions: tl.constexpr = (tile // lanes) * (tile // rows)
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
     index = region // regions
-    row = (index % tiles) // across * tile + region % regions // (tile // lanes) * rows
-    column = (index % tiles) % across * tile + region % (tile // lanes) * lanes
+    row = (index % tiles) // across * tile + region % regions // (tile // LANES) * rows
+    column = (index % tiles) % across * tile + region % (tile // LANES) * LANES
     return index, index // tiles, row, column
 
 
 @triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # type: ignore[untyped-decorator]  # no types
 def _reach_kernel(
-    means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor, offsets: tl.tensor, flat: tl.tensor,
-    reached: tl.tensor, across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, batch: tl.constexpr,
+    records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
+    across: int, tiles: int, all_tiles: int, pairs: int,
+    columns: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, threads: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Set a bit of each pair for each region of its tile that it reaches."""
+    """Write which of the tile's pairs reach each of its regions, a bit for each pair."""
     index = tl.program_id(0)
     row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
+    regions: tl.constexpr = (tile // columns) * (tile // rows)
     begin = tl.load(offsets + index)
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    block = _first_word(index, begin, regions)
+    thread = tl.arange(0, threads)
     while begin < stop:
-        pair = begin + tl.arange(0, batch)
-        there = pair < stop
-        gaussian = tl.load(flat + pair, there, 0)
-        x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
-        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
-        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-        found = tl.zeros((batch,), tl.int32)
-        for region in tl.static_range((tile // lanes) * (tile // rows)):
-            left, top = region % (tile // lanes) * lanes, region // (tile // lanes) * rows
-            found |= _reaches(x - left, y - top, a, b, c, opacity, lanes, rows).to(tl.int32) << region
-        tl.store(reached + pair, found.to(reached.dtype.element_ty), there)
-        begin += batch
+        there = begin + thread < stop
+        gaussian = tl.load(flat + begin + thread, there, tl.load(flat + begin))
+        x, y, a, b = _load_four(records + record * gaussian)
+        c, opacity, _, _ = _load_four(records + record * gaussian + 4)
+        x, y = x - (column + 0.5), y - (row + 0.5)
+        word = tl.zeros((threads,), tl.int32)  # of the region that has a thread's number in its warp
+        for region in tl.static_range(regions):
+            left, top = region % (tile // columns) * columns, region // (tile // columns) * rows
+            reaches = there & _reaches(x - left, y - top, a, b, c, opacity, columns, rows)
+            word = tl.where(thread % 32 == region, _ballot(reaches), word)
+        wanted = (thread % 32 < regions) & (begin + thread // 32 * 32 < stop)
+        tl.store(words + block + thread // 32 * regions + thread % 32, word, wanted)
+        begin += threads
+        block += threads // 32 * regions
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _first_word(index: tl.tensor, begin: tl.tensor, regions: tl.constexpr) -> tl.tensor:
+    """Return where the words of a tile begin: they have 32 pairs each, the last one of a tile maybe fewer."""
+    return (begin // 32 + index) * regions
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _pairs(
+    begin: tl.tensor, stop: tl.tensor, flat: tl.tensor, words: tl.tensor, regions: tl.constexpr
+) -> tuple[tl.tensor, tl.tensor]:
+    """Load the next 64 pairs: their Gaussians, and the words that say for each 32 which of them reach the region."""
+    pair = tl.arange(0, 64)
+    gaussian = tl.load(flat + begin + pair, begin + pair < stop, 0)
+    return gaussian, tl.load(words + pair // 32 * regions, begin + pair // 32 * 32 < stop, 0)
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _fill(
     queue: tl.tensor, begin: tl.tensor, stop: tl.tensor, head: tl.tensor, tail: tl.tensor,
-    flat: tl.tensor, reached: tl.tensor, means2d: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
-    row: tl.tensor, column: tl.tensor,
-    bucket: tl.constexpr, lanes: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, batch: tl.constexpr,
-    ahead: tl.constexpr,
-) -> tuple[tl.tensor, tl.tensor]:  # fmt: skip
+    gaussian: tl.tensor, word: tl.tensor, flat: tl.tensor, words: tl.tensor,
+    regions: tl.constexpr, bucket: tl.constexpr,
+) -> tuple[tl.tensor, ...]:  # fmt: skip
     """Put Gaussians that reach the region in the queue, until it has a bucket of them or the pairs end.
 
+    Args:
+        gaussian, word: of the next 64 pairs. Those after are loaded before they are needed, because loading takes as
+            long as blending many Gaussians.
+
     Returns:
-        The next pair, and how many Gaussians have entered the queue.
+        The next pair and its word, how many Gaussians have entered the queue, and the next `gaussian` and `word`.
     """
-    in_batch = tl.arange(0, batch)
-    size: tl.constexpr = 2 * batch
+    pair = tl.arange(0, 64)
     while (begin < stop) & (tail - head < bucket):
-        there = begin + in_batch < stop
-        gaussian = tl.load(flat + begin + in_batch, there, 0)
-        if ahead:
-            region = tl.program_id(0) % ((tile // lanes) * (tile // rows))
-            bits = tl.load(reached + begin + in_batch, there, 0).to(tl.int32)
-            wanted = (bits >> region) & 1 != 0
-        else:
-            x = tl.load(means2d + 2 * gaussian) - (column + 0.5)
-            y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5)
-            a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-            c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-            wanted = there & _reaches(x, y, a, b, c, opacity, lanes, rows)
-        slot = (tail + tl.cumsum(wanted.to(tl.int32), 0) - 1) & (size - 1)
+        wanted = (word >> (pair % 32)) & 1
+        before = _count_bits(word & ((1 << (pair % 32)) - 1))
+        before += tl.where(pair < 32, 0, tl.sum(tl.where(pair < 32, wanted, 0), 0))
+        slot = (tail + before) & 127
         tl.debug_barrier()  # all threads have read the bucket before
-        tl.store(queue + slot, gaussian, wanted)
+        tl.store(queue + slot, gaussian, wanted != 0)
+        tail += tl.sum(wanted, 0)
+        begin += 64
+        words += 2 * regions
+        gaussian, word = _pairs(begin, stop, flat, words, regions)
         tl.debug_barrier()  # threads read what others wrote
-        tail += tl.sum(wanted.to(tl.int32), 0)
-        begin += batch
-    return begin, tail
+    return begin, words, tail, gaussian, word
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _bucket(
+    queue: tl.tensor, head: tl.tensor, tail: tl.tensor, another: tl.tensor, records: tl.tensor,
+    splats: tl.constexpr, record: tl.constexpr,
+) -> tuple[tl.tensor, ...]:  # fmt: skip
+    """Load the queue's next bucket: the Gaussians, whether they are there, and x, y, a, b, c, opacity and colours.
+
+    Those that are not there have the numbers of the last Gaussian, or of `another`, which are finite.
+    """
+    # Which Gaussian of a bucket an element is; those in one thread are consecutive.
+    order = tl.arange(0, SPLAT_LANES)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
+    order = tl.broadcast_to(order, (LANES, SPLAT_LANES, splats, 1)) + head
+    gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & 127), tail > 0, another)
+    x, y, a, b = _load_four(records + record * gaussian)
+    c, opacity, _, _ = _load_four(records + record * gaussian + 4)
+    red, green, blue, _ = _load_four(records + record * gaussian + 8)
+    tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
+    return gaussian, order < tail, x, y, a, b, c, opacity, red, green, blue
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -237,20 +322,32 @@ def _alphas(
     return tl.where(there & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
+    """Return the transmittances before and after each Gaussian, and after the bucket."""
+    left = 1.0 - alpha
+    second = tl.arange(0, alpha.shape[2])[None, None, :, None] == 1  # of a thread's Gaussians
+    by_both = tl.reduce(left, 2, _multiply, keep_dims=True)
+    by_first = tl.reduce(tl.where(second, 1.0, left), 2, _multiply, keep_dims=True)
+    before, by_all = _product_before(by_both)
+    before *= transmittance
+    after = before * tl.where(second, by_both, by_first)
+    return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
+
+
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _forward_kernel(
-    means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor, background: tl.tensor,
-    offsets: tl.tensor, flat: tl.tensor, reached: tl.tensor, images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
+    records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
+    images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
-    tile: tl.constexpr, batch: tl.constexpr, ahead: tl.constexpr,
+    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
-    bucket: tl.constexpr = splats * splat_lanes
-    size: tl.constexpr = 2 * batch  # of the queue: it has room for a batch and almost a bucket
-    index, image, row, column = _region(across, tiles, lanes, rows, tile)
-    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
-    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    bucket: tl.constexpr = splats * SPLAT_LANES
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
+    index, image, row, column = _region(across, tiles, rows, tile)
+    along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
     transmittance = tl.where(inside, 1.0, 0.0)
     # Sums over the Gaussians of each thread.
@@ -258,38 +355,34 @@ def _forward_kernel(
 
     begin = tl.load(offsets + index)
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    queue = queues + tl.program_id(0) * size
-    order = tl.arange(0, splat_lanes)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
-    order = tl.broadcast_to(order, (lanes, splat_lanes, splats, 1))
+    another = tl.load(flat + begin, begin < stop, 0)
+    words += _first_word(index, begin, regions) + tl.program_id(0) % regions
+    queue = queues + tl.program_id(0) * 128  # room for 64 pairs and almost a bucket
+    gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0
-    while (begin < stop) | (head < tail):
-        begin, tail = _fill(
-            queue, begin, stop, head, tail, flat, reached, means2d, conics, opacities, row, column,
-            bucket, lanes, rows, tile, batch, ahead,
-        )  # fmt: skip
-        there = head + order < tail
-        gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
+    begin, words, tail, gaussians, word = _fill(
+        queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+    )
+    _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
+        queue, head, tail, another, records, splats, record
+    )
+    while head < tail:
+        # The next bucket is loaded before this one is blended, because loading takes as long.
         head += bucket
-        x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)
-        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)
-        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-        color_r, color_g = tl.load(colors + 3 * gaussian, there, 0.0), tl.load(colors + 3 * gaussian + 1, there, 0.0)
-        color_b = tl.load(colors + 3 * gaussian + 2, there, 0.0)
-        tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
-        alpha = _alphas(x, y, a, b, c, opacity, there)
-        left = 1.0 - alpha
-        of_lane = tl.reduce(left, 2, _multiply, keep_dims=True)
-        upto = tl.cumprod(of_lane, 1)
-        after = transmittance * (upto * _inverse(of_lane)) * tl.cumprod(left, 2)
-        transmittance *= tl.reduce(of_lane, 1, _multiply, keep_dims=True)
-        weight = tl.where(after > LEAST, alpha * after * _inverse(left), 0.0)
+        begin, words, tail, gaussians, word = _fill(
+            queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+        )
+        following = _bucket(queue, head, tail, another, records, splats, record)
+        alpha = _alphas(x - (column + 0.5 + along), y - (row + 0.5 + down), a, b, c, opacity, there)
+        before, after, transmittance = _transmittances(alpha, transmittance)
+        weight = tl.where(after > LEAST, alpha * before, 0.0)
         red += tl.sum(weight * color_r, 2, keep_dims=True)
         green += tl.sum(weight * color_g, 2, keep_dims=True)
         blue += tl.sum(weight * color_b, 2, keep_dims=True)
         cover += tl.sum(weight, 2, keep_dims=True)
-        if tl.max(tl.max(tl.max(tl.max(transmittance, 3), 2), 1), 0) <= LEAST:  # all pixels ended
+        if tl.max((transmittance > LEAST).to(tl.int32)) == 0:  # all pixels ended
             begin, tail = stop, head
+        _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = following
     tl.store(counts + tl.program_id(0), tl.minimum(head, tail))
 
     pixel = images + 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
@@ -300,25 +393,61 @@ def _forward_kernel(
     tl.store(pixel + 2, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _add_gradients(
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
+    by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
+    gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
+    absolute: tl.constexpr,
+) -> None:  # fmt: skip
+    """Add a bucket's gradients, summed over pixels, to those of all tiles.
+
+    `x` and `y` are a Gaussian's centre less a pixel's, `by_sigma` the gradient by half its squared distance.
+    """
+    # Sums over rows; x is the same in all of them.
+    plain, by_y = tl.sum(by_sigma, 3, keep_dims=True), tl.sum(by_sigma * y, 3, keep_dims=True)
+    by_yy, by_x = tl.sum(by_sigma * y * y, 3, keep_dims=True), plain * x
+    red, green = tl.sum(by_red, 3, keep_dims=True), tl.sum(by_green, 3, keep_dims=True)
+    blue, faint = tl.sum(by_blue, 3, keep_dims=True), -plain * _inverse(opacity)
+    # Sums over columns: of a pair of threads each keeps four of eight values, and then two, instead of all in each.
+    # What is left in the thread of column i are the numbers 2 i and 2 i + 1 of a Gaussian's `GRADIENT` ones.
+    of_red = _sum_of_pair(red, a * by_x + b * by_y, 2)
+    of_green = _sum_of_pair(green, b * by_x + c * by_y, 2)
+    of_blue = _sum_of_pair(blue, 0.5 * by_x * x, 2)
+    of_opacity = _sum_of_pair(faint, by_y * x, 2)
+    first = _sum_of_pair(of_red, of_blue, 1)
+    second = _sum_of_pair(of_green, of_opacity, 1)
+    lane = tl.arange(0, LANES)[:, None, None, None]
+    start = gradients + 8 * gaussian
+    tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
+    tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
+    value = tl.sum(0.5 * by_yy, 0, keep_dims=True)
+    if absolute:
+        along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3, keep_dims=True), 0, keep_dims=True)
+        along_y = tl.sum(tl.sum(tl.abs(by_sigma * (b * x + c * y)), 3, keep_dims=True), 0, keep_dims=True)
+        value = tl.where(lane == 0, value, tl.where(lane == 1, along_x, along_y))
+        tl.atomic_add(others + 3 * gaussian + lane, value, there & (lane < 3), sem="relaxed")
+    else:
+        tl.atomic_add(others + gaussian, tl.where(lane == 0, value, 0.0), there & (lane == 0), sem="relaxed")
+
+
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _backward_kernel(
-    means2d: tl.tensor, conics: tl.tensor, colors: tl.tensor, opacities: tl.tensor,
-    offsets: tl.tensor, flat: tl.tensor, reached: tl.tensor, counts: tl.tensor, images: tl.tensor,
-    by_images: tl.tensor,
-    by_means2d: tl.tensor, by_absolute: tl.tensor, by_conics: tl.tensor, by_colors: tl.tensor, by_opacities: tl.tensor,
-    queues: tl.tensor,
+    records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
+    counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
+    gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
-    lanes: tl.constexpr, rows: tl.constexpr, splat_lanes: tl.constexpr, splats: tl.constexpr,
-    tile: tl.constexpr, batch: tl.constexpr, ahead: tl.constexpr, absolute: tl.constexpr,
+    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
+    absolute: tl.constexpr,
 ) -> None:  # fmt: skip
-    # Tensors have the axes (lanes, splat_lanes, splats, rows). Triton spreads the first axes over threads, because it
+    # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
-    # products over splats need no shuffles.
-    bucket: tl.constexpr = splats * splat_lanes
-    size: tl.constexpr = 2 * batch  # of the queue: it has room for a batch and almost a bucket
-    index, image, row, column = _region(across, tiles, lanes, rows, tile)
-    along = tl.broadcast_to(tl.arange(0, lanes)[:, None, None, None], (lanes, splat_lanes, 1, 1))
-    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (lanes, splat_lanes, 1, rows))
+    # products over splats need no shuffles. `_swapped` relies on it; a layout of another release fails the self-check.
+    bucket: tl.constexpr = splats * SPLAT_LANES
+    regions: tl.constexpr = (tile // LANES) * (tile // rows)
+    index, image, row, column = _region(across, tiles, rows, tile)
+    along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
+    down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
     pixel = 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
     red = tl.load(by_images + pixel, inside, 0.0)
@@ -326,63 +455,65 @@ def _backward_kernel(
     behind = red * tl.load(images + pixel, inside, 0.0)
     behind += green * tl.load(images + pixel + 1, inside, 0.0) + blue * tl.load(images + pixel + 2, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
+    second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
     begin, count = tl.load(offsets + index), tl.load(counts + tl.program_id(0))
     stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    queue = queues + tl.program_id(0) * size
-    # Which Gaussian of a bucket an element is; those in one thread are consecutive.
-    order_of_sums = tl.arange(0, splat_lanes)[:, None] * splats + tl.arange(0, splats)[None, :]
-    order = tl.broadcast_to(order_of_sums[None, :, :, None], (lanes, splat_lanes, splats, 1))
+    another = tl.load(flat + begin, begin < stop, 0)
+    words += _first_word(index, begin, regions) + tl.program_id(0) % regions
+    queue = queues + tl.program_id(0) * 128
+    gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0  # numbers of Gaussians that left the queue and that entered it
     while head < count:
-        begin, tail = _fill(
-            queue, begin, stop, head, tail, flat, reached, means2d, conics, opacities, row, column,
-            bucket, lanes, rows, tile, batch, ahead,
-        )  # fmt: skip
-        there = head + order < tail
-        gaussian = tl.load(queue + ((head + order) & (size - 1)), there, 0)
-        there_of_sums = head + order_of_sums < tail
-        of_sums = tl.load(queue + ((head + order_of_sums) & (size - 1)), there_of_sums, 0)
+        begin, words, tail, gaussians, word = _fill(
+            queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
+        )
+        gaussian, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
+            queue, head, tail, another, records, splats, record
+        )
         head += bucket
-        x = tl.load(means2d + 2 * gaussian) - (column + 0.5 + along)  # (lanes, splat_lanes, splats, 1)
-        y = tl.load(means2d + 2 * gaussian + 1) - (row + 0.5 + down)  # (lanes, splat_lanes, splats, rows)
-        a, b = tl.load(conics + 3 * gaussian), tl.load(conics + 3 * gaussian + 1)
-        c, opacity = tl.load(conics + 3 * gaussian + 2), tl.load(opacities + gaussian)
-        color_r, color_g = tl.load(colors + 3 * gaussian, there, 0.0), tl.load(colors + 3 * gaussian + 1, there, 0.0)
-        color_b = tl.load(colors + 3 * gaussian + 2, there, 0.0)
-        tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
+        x = x - (column + 0.5 + along)  # (LANES, SPLAT_LANES, splats, 1)
+        y = y - (row + 0.5 + down)  # (LANES, SPLAT_LANES, splats, rows)
         alpha = _alphas(x, y, a, b, c, opacity, there)
-        left = 1.0 - alpha
-        inverse = _inverse(left)
-        # Products up to each Gaussian: of those before in the same thread, and of threads before.
-        of_lane = tl.reduce(left, 2, _multiply, keep_dims=True)
-        upto = tl.cumprod(of_lane, 1)
-        after = transmittance * (upto * _inverse(of_lane)) * tl.cumprod(left, 2)
-        transmittance *= tl.reduce(of_lane, 1, _multiply, keep_dims=True)
+        inverse = _inverse(1.0 - alpha)
+        before, after, transmittance = _transmittances(alpha, transmittance)
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
-        before = after * inverse
         weight = alpha * before
-        shine = color_r * red + color_g * green + color_b * blue
-        added = weight * shine
-        of_lane = tl.sum(added, 2, keep_dims=True)
-        upto = tl.cumsum(of_lane, 1)
-        by_alpha = before * shine - (behind - (upto - of_lane) - tl.cumsum(added, 2)) * inverse
-        behind -= tl.sum(of_lane, 1, keep_dims=True)
-        by_sigma = tl.where(alpha < OPAQUEST, -alpha * by_alpha, 0.0)
+        added = weight * (color_r * red + color_g * green + color_b * blue)
+        by_both = tl.sum(added, 2, keep_dims=True)
+        by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
+        added_before, by_all = _sum_before(by_both)
+        still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
+        behind -= by_all
+        # The gradient by alpha, times -alpha.
+        by_sigma = tl.where(alpha < OPAQUEST, still_behind * (alpha * inverse) - added, 0.0)
         _add_gradients(
-            x, y, a, b, c, by_sigma, weight * red, weight * green, weight * blue, of_sums, there_of_sums, conics,
-            opacities, by_means2d, by_absolute, by_conics, by_colors, by_opacities, absolute,
+            x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue,
+            gaussian, there, gradients, others, absolute,
         )  # fmt: skip
+
+
+@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _split_kernel(
+    gradients: tl.tensor, others: tl.tensor, by_means2d: tl.tensor, by_conics: tl.tensor, n: int,
+    each: tl.constexpr, block: tl.constexpr,
+) -> None:  # fmt: skip
+    row = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
+    here = row < n
+    for i in tl.static_range(2):
+        tl.store(by_means2d + 2 * row + i, tl.load(gradients + 8 * row + 4 + i, here), here)
+        tl.store(by_conics + 3 * row + i, tl.load(gradients + 8 * row + 6 + i, here), here)
+    tl.store(by_conics + 3 * row + 2, tl.load(others + each * row, here), here)
 
 
 def blend_forward(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, background: Tensor,
-    offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE
+) -> tuple[Tensor, Tensor, Tensor]:
     """Blend the Gaussians of each tile; arguments are contiguous.
 
     Args:
-        means2d, conics, colors, opacities: (c, n, 2), (c, n, 3), (c, n, 3) and (c, n) float32 of c cameras.
+        records: (c, n, RECORD) float32 of c cameras, or (n, RECORD) of several images' Gaussians in one list; numbers
+            of Gaussians in no tile are never read.
         background: (c, 3) float32.
         offsets: (c, tiles down, tiles across) int32, the first pair of each tile.
         flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile.
@@ -390,62 +521,65 @@ def blend_forward(
         shape: of a program's work.
 
     Returns:
-        Images (c, h, w, 3); the number of Gaussians in each region that reach it before all its pixels end; and the
-        regions that each pair reaches, empty if the shape does not look `ahead`.
+        Images (c, h, w, 3); the number of Gaussians in each region that reach it before all its pixels end; and
+        words whose bits say which pairs reach a region.
     """
     width, height = size
     programs, numbers = _launch_of(offsets, flat, size, shape)
-    reached = flat.new_empty(len(flat) if shape.ahead else 0, dtype=torch.int16 if shape.regions <= 16 else torch.int32)
-    if shape.ahead:
-        _reach_kernel[(offsets.numel(),)](
-            means2d, conics, opacities, offsets, flat, reached, *numbers[2:],
-            lanes=shape.lanes, rows=shape.rows, tile=TILE, batch=REACH_BATCH, num_warps=REACH_WARPS, **FUSED,
-        )  # fmt: skip
-    images = means2d.new_empty(len(offsets), height, width, 3)
+    words = flat.new_empty((len(flat) // WARP + offsets.numel()) * shape.regions)
+    _reach_kernel[(offsets.numel(),)](
+        records, offsets, flat, words, *numbers[2:],
+        columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
+        num_warps=REACH_WARPS, **FUSED,
+    )  # fmt: skip
+    images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
-        means2d, conics, colors, opacities, background, offsets, flat, reached, images, counts,
-        flat.new_empty(programs, 2 * shape.batch), *numbers,
-        lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, ahead=shape.ahead, num_warps=shape.warps, **FUSED,
+        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 4 * WARP),
+        *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
+        num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
     )  # fmt: skip
-    return images, counts, reached
+    return images, counts, words
 
 
 def blend_backward(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, offsets: Tensor, flat: Tensor, images: Tensor,
-    counts: Tensor, reached: Tensor, by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
+    records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, counts: Tensor, words: Tensor,
+    by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Return the gradients of blending by centres, conics, colours and opacities; arguments are contiguous.
 
     Args:
-        means2d, conics, colors, opacities, offsets, flat: as `blend_forward` takes them.
-        images, counts, reached: its results, made with the same shape.
+        records: (c, n, RECORD).
+        offsets, flat: as `blend_forward` takes them.
+        images, counts, words: its results, made with the same shape.
         by_images: gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
 
     Returns:
-        Sums of absolute values (c, n, 2), meaningless without `absolute`; gradients by `means2d`, `conics`, `colors`
-        and `opacities`.
+        Sums of absolute values (c, n, 2), meaningless without `absolute`; gradients by centres (c, n, 2) and conics
+        (c, n, 3), contiguous, and by colours (c, n, 3) and opacities (c, n), which are views with `GRADIENT` numbers
+        for each Gaussian.
     """
-    by_means2d = torch.zeros_like(means2d)
-    by_absolute = torch.zeros_like(means2d) if absolute else by_means2d
-    by_opacities = torch.zeros_like(opacities)
-    # One launch for both; each begins at a multiple of 16 bytes, or Triton would compile for where it begins.
-    end = -(-conics.numel() // 4) * 4
-    zeros = conics.new_zeros(2 * end)
-    by_conics, by_colors = zeros[: conics.numel()].view_as(conics), zeros[end : end + colors.numel()].view_as(colors)
     programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), shape)
     assert len(counts) == programs
+    count, each = records.numel() // RECORD, 3 if absolute else 1
+    zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
+    found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     _backward_kernel[(programs,)](
-        means2d, conics, colors, opacities, offsets, flat, reached, counts, images, by_images,
-        by_means2d, by_absolute, by_conics, by_colors, by_opacities,
-        flat.new_empty(programs, 2 * shape.batch), *numbers,
-        lanes=shape.lanes, rows=shape.rows, splat_lanes=shape.splat_lanes, splats=shape.splats,
-        tile=TILE, batch=shape.batch, ahead=shape.ahead, absolute=absolute, num_warps=shape.warps, **FUSED,
+        records, offsets, flat, words, counts, images, by_images, found, others,
+        flat.new_empty(programs, 4 * WARP), *numbers,
+        rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
+        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
     )  # fmt: skip
-    return by_absolute, by_means2d, by_conics, by_colors, by_opacities
+    leading = records.shape[:-1]
+    by_means2d, by_conics = records.new_empty(*leading, 2), records.new_empty(*leading, 3)
+    _split_kernel[(triton.cdiv(count, SPLIT_BLOCK),)](
+        found, others, by_means2d, by_conics, count, each=each, block=SPLIT_BLOCK, **FUSED
+    )
+    found = found.view(*leading, GRADIENT)
+    by_absolute = others.view(*leading, 3)[..., 1:] if absolute else by_means2d
+    return by_absolute, by_means2d, by_conics, found[..., :3], found[..., 3]
 
 
 def _launch_of(offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape) -> tuple[int, tuple[int, ...]]:

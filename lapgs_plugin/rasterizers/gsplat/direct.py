@@ -36,7 +36,6 @@ class Intermediates(NamedTuple):
     given: ToBlend
     blended: Blended
     radii: Tensor  # (c, n, 2)
-    depths: Tensor  # (c, n)
     scales: Tensor  # (n, 3)
     visible_radii: Tensor  # (c, n) the larger of both, 0 where culled
     centres: Tensor  # (c, n, 2) as in `RenderResult.means2d`
@@ -101,8 +100,9 @@ def _render(
             options = cameras, background, degree, field.signed, describes, absgrad, box, targets
             image: Tensor = _Render.apply(means, quaternions, log_scales, logits, sh, *options)  # type: ignore[no-untyped-call]  # torch's
             return image, box[0], targets
+        ours = our_kernels_blend(means, len(cameras.poses) * cameras.width * cameras.height)
         found = forward(
-            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes, ours=False
+            means, quaternions, log_scales, logits, sh, cameras, background, degree, field.signed, describes, ours
         )
     return _channels_first(found.blended.images), found, targets
 
@@ -137,8 +137,8 @@ class _Render(torch.autograd.Function):
         from lapgs_plugin.rasterizers.gsplat.kernels import finish_gradients
 
         means, quaternions, sh, poses, intrinsics, centres, *rest = ctx.saved_tensors
-        given, blended = ToBlend(*rest[:7]), Blended(*rest[7:11])
-        found, (width, height) = Intermediates(given, blended, *rest[11:]), ctx.size
+        given, blended = ToBlend(*rest[:8]), Blended(*rest[8:12])
+        found, (width, height) = Intermediates(given, blended, *rest[12:]), ctx.size
         by_images = by_image.movedim(-3, -1).view(blended.images.shape)
         by_absolute: Tensor | None
         by_absolute, by_means2d, by_conics, by_colors, by_opacities = gradients(given, blended, by_images, ctx.absgrad)
@@ -146,17 +146,17 @@ class _Render(torch.autograd.Function):
         by_means, _, by_quaternions, by_scales, _ = compiled.projection_ewa_3dgs_fused_bwd(
             means, None, quaternions, found.scales, poses, intrinsics, width, height, PIXEL_VARIANCE,
             compiled.CameraModelType.PINHOLE, found.radii, given.conics, None,
-            by_means2d, bindings.zeros(found.depths.shape, means.device), by_conics, None, False,
+            by_means2d, bindings.zeros(found.radii.shape[:2], means.device), by_conics, None, False,
         )  # fmt: skip
-        by_sh = finish_gradients(
-            means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities,
+        by_sh, by_logits = finish_gradients(
+            means, centres, sh, ctx.degree, ctx.signed, found.radii, given.colors, found.scales, given.opacities[0],
             by_colors, by_means, by_scales, by_opacities,
         )  # fmt: skip
         by_absolute = by_absolute if ctx.absgrad else None
         if len(poses) == 1:
             by_means2d, by_absolute = by_means2d[0], None if by_absolute is None else by_absolute[0]
         _write_gradients(ctx.targets, by_means2d, by_absolute)
-        return by_means, by_quaternions, by_scales, by_opacities[0], by_sh, *[None] * 8
+        return by_means, by_quaternions, by_scales, by_logits, by_sh, *[None] * 8
 
 
 def forward(
@@ -169,13 +169,15 @@ def forward(
     size, count = (cameras.width, cameras.height), len(cameras.poses)
     scales, opacities = activate(log_scales, logits)
     projected = bindings.project(means, quaternions, scales, opacities, cameras.poses, cameras.intrinsics, size)
-    radii, means2d, depths, conics = projected
-    pixels = means2d if describes else None
-    colors, visible_radii, centres = visible_colors(means, cameras.centres, sh, degree, signed, radii, pixels)
-    opacities = _for_each_camera(opacities, count)
+    radii, means2d, _, conics = projected
+    colors, visible_radii, centres, records = visible_colors(
+        means, cameras.centres, sh, degree, signed, radii, describes, (means2d, conics, opacities), ours
+    )
+    opacities = _for_each_camera(opacities, 1 if ours else count)
     tiles = bindings.sort_into_tiles(projected, size, count)
-    given = ToBlend(means2d, conics, colors, opacities, background, *tiles)
-    return Intermediates(given, blend(given, size, ours), radii, depths, scales, visible_radii, centres)
+    means2d = records[..., :2] if ours else means2d  # whatever is kept for the backward pass takes memory
+    given = ToBlend(means2d, conics, colors, opacities, background, *tiles, records)
+    return Intermediates(given, blend(given, size), radii, scales, visible_radii, centres)
 
 
 def _for_each_camera(values: Tensor, cameras: int) -> Tensor:

@@ -15,6 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import COLOR_IN_RECORD, RECORD
 
 BLOCK = 128
 """Gaussians in a block. Each takes 4 threads, of which 3 have a channel: Triton's sizes are powers of 2."""
@@ -180,6 +181,21 @@ def _block_colors(
     return tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _write_record(
+    records: tl.tensor, placed: tl.tensor, pixels: tl.tensor, conics: tl.tensor, rows: tl.tensor,
+    opacity: tl.tensor, color: tl.tensor, channel: tl.tensor, visible: tl.tensor, record: tl.constexpr,
+) -> None:  # fmt: skip
+    """Write to the rows `placed` what blending reads of visible Gaussians, see `blend_gradients.RECORD`."""
+    conic = tl.load(conics + 3 * rows + channel - 2, visible & (channel >= 2), 0.0)
+    first = tl.load(pixels + 2 * rows + channel, visible & (channel < 2), 0.0) + conic
+    last = tl.load(conics + 3 * rows + 2, visible, 0.0)
+    start = records + placed * record + channel
+    tl.store(start, first, visible)
+    tl.store(start + 4, tl.where(channel == 0, last, opacity), visible & (channel < 2))
+    tl.store(start + 8, color, visible & (channel < 3))
+
+
 @triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _activate_kernel(
     log_scales: tl.tensor, logits: tl.tensor, scales: tl.tensor, opacities: tl.tensor, n: int, block: tl.constexpr
@@ -194,10 +210,11 @@ def _activate_kernel(
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _color_kernel(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, pixels: tl.tensor,
+    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor,
+    pixels: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
     colors: tl.tensor, visible_radii: tl.tensor, visible_pixels: tl.tensor,
     n: int, cameras: int, active: int, signed: int,
-    coefficients: tl.constexpr, describes: tl.constexpr, block: tl.constexpr,
+    coefficients: tl.constexpr, describes: tl.constexpr, packs: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     # Cameras of one block are consecutive, so that its coefficients are still in the cache.
     camera = tl.program_id(0) % cameras
@@ -208,7 +225,11 @@ def _color_kernel(
     across, down = tl.load(radii + 2 * seen, here, 0), tl.load(radii + 2 * seen + 1, here, 0)
     visible = (across > 0) & (down > 0)
     color = _block_colors(means, centre + 3 * camera, sh, rows, channel, visible, active, signed, coefficients, block)
-    tl.store(colors + seen * 3 + channel, color, here & (channel < 3))
+    if packs:
+        opacity = tl.load(opacities + rows, visible, 0.0)
+        _write_record(colors, seen, pixels, conics, seen, opacity, color, channel, visible, record)
+    else:
+        tl.store(colors + seen * 3 + channel, color, here & (channel < 3))
     if describes:
         tl.store(visible_radii + seen, tl.where(visible, tl.maximum(across, down), 0), here)
         for side in tl.static_range(2):
@@ -219,21 +240,22 @@ def _color_kernel(
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _stack_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor,
-    radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, conics: tl.tensor,
-    all_radii: tl.tensor, all_pixels: tl.tensor, all_depths: tl.tensor, all_conics: tl.tensor, all_colors: tl.tensor,
-    n: int, active: int, signed: int, start: int, coefficients: tl.constexpr, block: tl.constexpr,
+    opacities: tl.tensor, radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, conics: tl.tensor,
+    all_radii: tl.tensor, all_pixels: tl.tensor, all_depths: tl.tensor, records: tl.tensor,
+    n: int, active: int, signed: int, start: int,
+    coefficients: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
     channel = tl.arange(0, 4)[None, :]
-    here, pair, triple = rows < n, (rows < n) & (channel < 2), (rows < n) & (channel < 3)
+    here, pair = rows < n, (rows < n) & (channel < 2)
     placed = rows + start
     across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
     visible = (across > 0) & (down > 0)
     color = _block_colors(means, centre, sh, rows, channel, visible, active, signed, coefficients, block)
-    tl.store(all_colors + 3 * placed + channel, color, triple)
+    opacity = tl.load(opacities + rows, visible, 0.0)
+    _write_record(records, placed, pixels, conics, rows, opacity, color, channel, visible, record)
     tl.store(all_radii + 2 * placed + channel, tl.load(radii + 2 * rows + channel, pair, 0), pair)
     tl.store(all_pixels + 2 * placed + channel, tl.load(pixels + 2 * rows + channel, pair, 0.0), pair)
-    tl.store(all_conics + 3 * placed + channel, tl.load(conics + 3 * rows + channel, triple, 0.0), triple)
     tl.store(all_depths + placed, tl.load(depths + rows, here, 0.0), here)
 
 
@@ -260,8 +282,10 @@ def _all_of_basis(
 def _gradient_kernel(
     means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
     scales: tl.tensor, opacities: tl.tensor,
-    by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor, by_sh: tl.tensor,
+    by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
+    by_sh: tl.tensor, by_logit: tl.tensor,
     n: tl.tensor, cameras: int, active: int, signed: int,
+    of_color: tl.constexpr, of_by_color: tl.constexpr, of_by_opacity: tl.constexpr,
     coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers.
@@ -285,8 +309,8 @@ def _gradient_kernel(
         seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
         visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
         x, y, z, inverse = _view_directions(mean, centre + 3 * camera, channel, here & visible)
-        flow = tl.load(by_color + 3 * seen + channel, in_channel & visible, 0.0)  # (g, 4)
-        color = tl.load(colors + 3 * seen + channel, in_channel & visible, 0.0)
+        flow = tl.load(by_color + of_by_color * seen + channel, in_channel & visible, 0.0)  # (g, 4)
+        color = tl.load(colors + of_color * seen + channel, in_channel & visible, 0.0)
         flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
         sums += _all_of_basis(0, k, x, y, z, coefficients) * flow[None]
         if coefficients > 1:
@@ -298,7 +322,7 @@ def _gradient_kernel(
             of_x += (in_x - radial * x) * inverse
             of_y += (in_y - radial * y) * inverse
             of_z += (in_z - radial * z) * inverse
-        of_opacity += tl.load(by_opacity + seen, here, 0.0)
+        of_opacity += tl.load(by_opacity + of_by_opacity * seen, here, 0.0)
         camera += 1
     tl.store(by_sh + in_sh, tl.where(k < active, sums, 0.0), given)
     tl.debug_barrier()  # all threads have read what is written now
@@ -308,7 +332,7 @@ def _gradient_kernel(
         tl.store(by_mean + there, tl.load(by_mean + there, in_channel) + moved, in_channel)
     tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
     opacity = tl.load(opacities + rows, here, 0.0)
-    tl.store(by_opacity + rows, of_opacity * opacity * (1.0 - opacity), here)
+    tl.store(by_logit + rows, of_opacity * opacity * (1.0 - opacity), here)
 
 
 def activate(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor]:
@@ -319,8 +343,9 @@ def activate(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor
 
 
 def visible_colors(
-    means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, pixels: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
+    means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, describes: bool,
+    splats: tuple[Tensor, Tensor, Tensor], packs: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Return the colours of Gaussians that are visible to c cameras, and their radii and centres.
 
     Args:
@@ -330,80 +355,95 @@ def visible_colors(
         degree: highest to evaluate.
         signed: whether colours are the raw SH values.
         radii: (c, n, 2) gsplat's, int32; 0 where culled.
-        pixels: (c, n, 2) gsplat's centres; None if radii and centres are not needed.
+        describes: whether radii and centres are needed.
+        splats: gsplat's centres (c, n, 2) and conics (c, n, 3), and opacities (n,).
+        packs: write records.
 
     Returns:
-        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as in `RenderResult`, both empty if
-        `pixels` is None.
+        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as in `RenderResult`, both empty unless
+        described; records (c, n, RECORD). If there are records, colours are a view of them and
+        neither means anything where culled; otherwise they are empty.
     """
-    (cameras, n), describes = radii.shape[:2], pixels is not None
-    colors = means.new_empty(cameras, n, 3)
+    cameras, n = radii.shape[:2]
+    colors = means.new_empty(cameras, n, RECORD if packs else 3)
     visible_radii = radii.new_empty(cameras, n if describes else 0)
     visible_pixels = means.new_empty(cameras, n if describes else 0, 2)
     _launch(
         _color_kernel,
         n,
-        (means, centre, sh, radii, means if pixels is None else pixels, colors, visible_radii, visible_pixels),
+        (means, centre, sh, radii, *splats, colors, visible_radii, visible_pixels),
         (cameras, (degree + 1) ** 2, int(signed)),
         programs=cameras,
         coefficients=sh.shape[1],
         describes=describes,
+        packs=packs,
+        record=RECORD,
     )
-    return colors, visible_radii, visible_pixels
+    if not packs:
+        return colors, visible_radii, visible_pixels, means.new_empty(0)
+    return colors[..., COLOR_IN_RECORD : COLOR_IN_RECORD + 3], visible_radii, visible_pixels, colors
 
 
 def write_to_stack(
     means: Tensor,
     centre: Tensor,
     sh: Tensor,
+    opacities: Tensor,
     signed: bool,
     projected: Sequence[Tensor],
     stacked: Sequence[Tensor],
     start: int,
 ) -> None:
-    """Write one field's projection and colours to the tensors of a stack of fields.
+    """Write one field's projection and records to the tensors of a stack of fields.
 
     Args:
         means, sh, signed: as `visible_colors` takes them; all coefficients are evaluated.
+        opacities: (n,).
         centre: (3,) of the camera.
         projected: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
-        stacked: the same of all fields, and colours (m, 3); written from row `start` on.
+        stacked: radii, centres and depths of all fields, and records (m, RECORD); written from
+            row `start` on, records where visible.
     """
     _launch(
         _stack_kernel,
         len(means),
-        (means, centre, sh, *projected, *stacked),
+        (means, centre, sh, opacities, *projected, *stacked),
         (sh.shape[1], int(signed), start),
         coefficients=sh.shape[1],
+        record=RECORD,
     )
 
 
 def finish_gradients(
     means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
     scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
-) -> Tensor:  # fmt: skip
-    """Return the gradient by SH (n, k, 3), summed over c cameras, and complete the other gradients in place.
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return the gradients by SH (n, k, 3) and by opacities' logits (n,), and complete the others in place.
 
     Args:
         means, centre, sh, degree, signed, radii: arguments of `visible_colors`.
         colors: its result.
         scales, opacities: results of `activate`.
-        by_color: (c, n, 3) gradients of each camera.
+        by_color: (c, n, 3) gradients of each camera; this and the next may be views with other numbers between rows.
+        by_opacity: (c, n) of each camera.
         by_mean: (n, 3) gradient summed over cameras; the part through the view direction is added.
         by_scale: (n, 3) gradient summed over cameras; becomes that by logarithms.
-        by_opacity: (c, n) of each camera; the first row becomes the sum by logits.
     """
-    by_sh, coefficients = torch.empty_like(sh), sh.shape[1]
+    by_sh, by_logit, coefficients = torch.empty_like(sh), torch.empty_like(opacities), sh.shape[1]
+    given = colors, scales, opacities, by_color, by_mean, by_scale, by_opacity
     _launch(
         _gradient_kernel,
         len(means),
-        (means, centre, sh, radii, colors, scales, opacities, by_color, by_mean, by_scale, by_opacity, by_sh),
+        (means, centre, sh, radii, *given, by_sh, by_logit),
         (len(radii), (degree + 1) ** 2, int(signed)),
         block=BLOCK // 4,  # one channel of a Gaussian for each thread
+        of_color=colors.stride(1),
+        of_by_color=by_color.stride(1),
+        of_by_opacity=by_opacity.stride(1),
         coefficients=coefficients,
         padded=triton.next_power_of_2(coefficients),
     )
-    return by_sh
+    return by_sh, by_logit
 
 
 def _launch(

@@ -28,6 +28,7 @@ from lapgs_plugin.fields.rasterizer import (
     require_color,
 )
 from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD, our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
@@ -35,7 +36,8 @@ from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differe
 
 NAME = "gsplat"
 MOST_NUMBERS = 2**31 - 1
-"""SH coefficients of a field that our kernels can number: 44 million Gaussians of degree 3."""
+"""SH coefficients of a field, or numbers that blending reads, that our kernels can count: those of 44 million Gaussians
+of degree 3, of 22 million seen by eight cameras."""
 
 LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
 SEMANTICS = Semantics(
@@ -158,7 +160,7 @@ class GsplatRasterizer(Rasterizer):
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         """Render images of several cameras together; see `fields.rasterizer.Rasterizer`."""
-        if len(field) == 0 or (len(cameras) == 1 and self._calls_kernels(field)):
+        if len(field) == 0 or self._calls_kernels(field, cameras=len(cameras)):
             images = self._images(field, cameras, background, None)
             return images[None] if len(cameras) == 1 else images
         return self._stock.images(field, cameras, background, field.sh_degree)
@@ -172,12 +174,14 @@ class GsplatRasterizer(Rasterizer):
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
-        direct = self._calls_kernels(*fields) and stacking_works()
+        nothing = torch.empty(0, device=self._device)
+        direct = self._calls_kernels(*fields) and stacking_works() and our_kernels_blend(nothing)
         return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
 
-    def _calls_kernels(self, *fields: GaussianField) -> bool:
-        """Return whether kernels are called directly, for fields that are rendered together."""
-        numbers = 3 * max(len(field) for field in fields) * max(field.sh.shape[1] for field in fields)
+    def _calls_kernels(self, *fields: GaussianField, cameras: int = 1) -> bool:
+        """Return whether kernels are called directly, for fields or cameras that are rendered together."""
+        coefficients = 3 * max(len(field) for field in fields) * max(field.sh.shape[1] for field in fields)
+        numbers = max(coefficients, RECORD * cameras * sum(map(len, fields)))
         return self._may_be_direct and numbers <= MOST_NUMBERS and (self._must_be_direct or direct_works())
 
     def _render(
@@ -188,7 +192,7 @@ class GsplatRasterizer(Rasterizer):
         degree, absgrad = degree_to_evaluate(field, sh_degree), self._absgrad
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad)
-        if self._calls_kernels(field):
+        if self._calls_kernels(field, cameras=len(cameras)):
             on_device, own_radii = self._cameras.get(cameras, field.means), self._stock.own_radii
             return direct.render(field, on_device, background, degree, absgrad=absgrad, own_radii=own_radii)
         return self._stock.render(field, cameras, background, degree, absgrad=absgrad)
@@ -201,7 +205,7 @@ class GsplatRasterizer(Rasterizer):
         degree = degree_to_evaluate(field, sh_degree)
         if len(field) == 0:
             return _without_gaussians(field, cameras, background, absgrad=False).image
-        if self._calls_kernels(field):
+        if self._calls_kernels(field, cameras=len(cameras)):
             return direct.render_images(field, self._cameras.get(cameras, field.means), background, degree)
         images = self._stock.images(field, cameras, background, degree)
         # All that follows in training reads channel by channel: better reordered once than in each operation.

@@ -12,6 +12,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.ops.self_check import largest, matches_reference
 from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import records_of
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization
 
@@ -73,11 +74,13 @@ def stacking_works(device: torch.device) -> float:
     )
     centre, radii = torch.tensor([0.3, -0.2, 0.5], device=device), torch.ones(300, 2, dtype=torch.int32, device=device)
     projected = radii, rotations[:, :2].contiguous(), depths, scales
-    stacked = [torch.zeros_like(part) for part in (*projected, means)]
-    write_to_stack(means, centre, sh, False, projected, stacked, 0)
-    degree = math.isqrt(sh.shape[1]) - 1
+    opacities, degree = depths.sigmoid(), math.isqrt(sh.shape[1]) - 1
     colors = sh_to_color(sh, torch.nn.functional.normalize(means - centre, dim=-1), degree, signed=False)
-    return largest((one - other).abs().float() for one, other in zip(stacked, (*projected, colors), strict=True))
+    records = records_of(projected[1], scales, colors, opacities)
+    stacked = [torch.zeros_like(part) for part in (*projected[:3], records)]
+    write_to_stack(means, centre, sh, opacities, False, projected, stacked, 0)
+    expected = *projected[:3], records
+    return largest((one - other).abs().float() for one, other in zip(stacked, expected, strict=True))
 
 
 def _random_parameters(count: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:

@@ -25,6 +25,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
 from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
+from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
@@ -44,6 +45,7 @@ class GsplatStack(FieldStack):
     ) -> None:
         self._antialiased = antialiased
         self._signed = [field.signed for field in fields]
+        self._unsigned = torch.tensor([[not signed] for signed in self._signed], device=device).float()  # (f, 1)
         self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field, and the end
         self._means = _joined([field.means for field in fields], device)  # (n, 3)
         self._quaternions = _joined([field.quaternions for field in fields], device)  # (n, 4)
@@ -66,12 +68,9 @@ class GsplatStack(FieldStack):
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
             with torch.cuda.device(self._means.device):  # Triton launches on the current device
-                projected, colors = self._project_directly(cameras, viewmats, intrinsics, positions[0])
-                count, size, of_image = len(colors), (width, height), self._images[: len(colors)]
-                offsets, flat = bindings.sort_into_tiles(projected, size, len(cameras), of_image)
-                images, alphas, _ = bindings.compiled_functions().rasterize_to_pixels_3dgs_fwd(
-                    *projected[1::2], colors, self._opacities[:count], None, None, *size, TILE, offsets, flat
-                )
+                images = self._render_directly(cameras, viewmats, intrinsics, positions[0], background, (width, height))
+            pairs = zip(images, cameras, strict=True)
+            return [image[: camera.height, : camera.width].permute(2, 0, 1) for image, camera in pairs]
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
@@ -86,24 +85,31 @@ class GsplatStack(FieldStack):
     def _rows(self, index: int) -> slice:
         return slice(self._starts[index], self._starts[index + 1])
 
-    def _project_directly(
-        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor
-    ) -> tuple[list[Tensor], Tensor]:
-        """Return the results of `_project`, without opacities, and of `_colors` in two launches per field."""
+    def _render_directly(
+        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor,
+        background: Tensor | None, size: tuple[int, int],
+    ) -> Tensor:  # fmt: skip
+        """Return images (f, h, w, 3) of the first fields in two launches for each and three for all."""
+        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
         from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
 
         count, like = self._starts[len(cameras)], self._means
         radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
-        means2d, depths, conics, colors = (like.new_empty(count, *columns) for columns in ((2,), (), (3,), (3,)))
+        means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
         for i, camera in enumerate(cameras):
             means, quaternions, scales, opacities, sh = self._parts[i]
             if len(means) == 0:
                 continue  # gsplat divides by their number
-            pose, matrix, size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
-            projected = bindings.project(means, quaternions, scales, opacities, pose, matrix, size)
-            stacked = radii, means2d, depths, conics, colors
-            write_to_stack(means, position, sh, self._signed[i], projected, stacked, self._starts[i])
-        return [radii, means2d, depths, conics], colors
+            pose, matrix, own_size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
+            projected = bindings.project(means, quaternions, scales, opacities, pose, matrix, own_size)
+            stacked = radii, means2d, depths, records
+            write_to_stack(means, position, sh, opacities, self._signed[i], projected, stacked, self._starts[i])
+        of_image = self._images[:count]
+        offsets, flat = bindings.sort_into_tiles([radii, means2d, depths], size, len(cameras), of_image)
+        behind = bindings.zeros(torch.Size((len(cameras), 3)), like.device)
+        if background is not None:
+            behind = self._unsigned[: len(cameras)] * background
+        return blend_forward(records, behind, offsets, flat, size)[0]
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
         """Return radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields."""
