@@ -100,9 +100,63 @@ if DEVICE == "cuda":
     assert found < 1e-3  # worst seen 3.4e-5, on an H200
 """
 
+WITH_GSPLAT = """
+from contextlib import nullcontext
+from dataclasses import replace
 
-def run_checks(device: str, **environment: str) -> None:
-    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{CHECKS}"]
+import pytest
+import torch
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers.gsplat import bindings, direct
+from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
+from tests.gsplat_on_cpu import Compiled, gsplat_on_cpu
+
+def field(count, signed):
+    generator = torch.Generator().manual_seed(count)
+    def normal(*shape):
+        return torch.randn(count, *shape, generator=generator)
+    means, log_scales = normal(3) + torch.tensor([0.0, 0.0, 4.0]), 0.3 * normal(3) - 2.0
+    return GaussianField(means, normal(4), log_scales, normal() + 1.0, 0.3 * normal(4, 3), signed)
+
+def close(found, expected):
+    pairs = zip(found, expected, strict=True)
+    worst = max(float((one - other).abs().max() / other.abs().max()) for one, other in pairs)
+    print(f"{worst:.1e}")
+    assert worst < 1e-5  # worst seen 9e-7
+
+camera, moved, some = Camera(24, 20, 30.0, 30.0, 12.0, 10.0, torch.eye(4)), torch.eye(4), torch.tensor([0.1, 0.2, 0.3])
+moved[0, 3] = 0.2
+with pytest.MonkeyPatch.context() as patch, gsplat_on_cpu():
+    patch.setattr(bindings, "compiled_functions", Compiled)
+    patch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    for cameras in ([camera], [camera, replace(camera, world_to_camera=moved)]):
+        for signed in (False, True):
+            found = []
+            for ours in (True, False):
+                patch.setattr(direct, "our_kernels_blend", lambda *given: ours)
+                given, on_device = field(50, signed), CameraCache().get(cameras, torch.zeros(1))
+                for value in given.parameters.values():
+                    value.requires_grad_()
+                result = direct.render(given, on_device, some, 1, absgrad=False, own_radii=True)
+                weights = torch.randn(result.image.shape, generator=torch.Generator().manual_seed(1))
+                (result.image * weights).sum().backward()
+                alone = direct.render_images(given.detach(), on_device, some, 1)
+                gradients = [result.means2d.grad, *(value.grad for value in given.parameters.values())]
+                found.append([result.image.detach(), alone, *gradients])
+            close(*found)
+    fields = [field(60, True), field(40, False)]
+    for cameras, background in (([camera, camera.resized(12, 10)], some), ([camera], None)):
+        close(*(
+            GsplatStack(fields, torch.device("cpu"), direct=direct).render(cameras, background)
+            for direct in (True, False)
+        ))
+"""
+
+
+def run_checks(device: str, checks: str = CHECKS, **environment: str) -> None:
+    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{checks}"]
     done = subprocess.run(command, check=False, env={**os.environ, **environment}, capture_output=True, text=True)
     print(done.stdout)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -111,6 +165,11 @@ def run_checks(device: str, **environment: str) -> None:
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 def test_interpreted() -> None:
     run_checks("cpu", TRITON_INTERPRET="1")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+def test_interpreted_between_gsplats_kernels() -> None:
+    run_checks("cpu", WITH_GSPLAT, TRITON_INTERPRET="1")
 
 
 @pytest.mark.gpu
