@@ -29,7 +29,7 @@ from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
-from lapgs_plugin.ops.position_noise.in_torch import displacements
+from lapgs_plugin.ops.position_noise.in_torch import add_noise_torch
 from lapgs_plugin.ops.regularization.in_torch import regularization_torch
 
 NUMBA = "Numba"
@@ -82,8 +82,8 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
         "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
         "Adam": _adam_versions(ours, gaussians, device),
         "densification statistics": _statistics_versions(ours, gaussians, device),
-        "regularization": _regularization_versions(gaussians, device),
-        "position noise": _noise_versions(gaussians, device),
+        "regularization": _regularization_versions(ours, gaussians, device),
+        "position noise": _noise_versions(ours, gaussians, device),
         "colour transform": _transform_versions(images[0]),
     }
     return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
@@ -234,7 +234,7 @@ def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Ver
     return versions
 
 
-def _regularization_versions(gaussians: int, device: torch.device) -> Versions:
+def _regularization_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn(gaussians, generator=generator).to(device).requires_grad_()
     log_scales = torch.randn(gaussians, 3, generator=generator).to(device).requires_grad_()
@@ -243,27 +243,22 @@ def _regularization_versions(gaussians: int, device: torch.device) -> Versions:
         return Version(lambda: torch.autograd.grad(compute(logits, log_scales, 1.0, 1.0), (logits, log_scales))[1])
 
     versions = {TORCH: version(regularization_torch)}
-    if regularization.triton_works(logits):
-        versions["Triton"] = version(regularization.regularization)
+    if ours != NUMBA and regularization.triton_works():
+        versions[ours] = version(regularization.regularization)
     return versions
 
 
-def _noise_versions(gaussians: int, device: torch.device) -> Versions:
+def _noise_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
-    columns = (4,), (3,), (), (3,)
-    given = [torch.randn(gaussians, *each, generator=generator).to(device) for each in columns]
+    quaternions, log_scales, logits, noise = (
+        torch.randn(gaussians, *columns, generator=generator).to(device) for columns in ((4,), (3,), (), (3,))
+    )
 
-    def moved(means: Tensor) -> None:
-        means += displacements(given[0], given[1], given[2], given[3], 1e-3)
-
-    def moved_in_one(means: Tensor) -> None:
-        position_noise.add_noise(means, given[0], given[1], given[2], given[3], 1e-3)
-
-    def version(move: Callable[[Tensor], None]) -> Version:
+    def version(add: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, float], None]) -> Version:
         means = torch.zeros(gaussians, 3, device=device)
-        return Version(lambda: move(means), means)
+        return Version(lambda: add(means, quaternions, log_scales, logits, noise, 1e-3), means)
 
-    versions = {TORCH: version(moved)}
-    if position_noise.triton_works(given[0]):
-        versions["Triton"] = version(moved_in_one)
+    versions = {TORCH: version(add_noise_torch)}
+    if ours != NUMBA and position_noise.triton_works():
+        versions[ours] = version(position_noise.add_noise)
     return versions

@@ -47,7 +47,7 @@ def find_image(path: Path) -> Path:
     if is_file(path) or not is_folder(path.parent):
         return path
     files = _by_plain_name(path.parent, path.parent.stat().st_mtime_ns)
-    alike = files.get(_plain(path.name)) or (files.get(_any_format(path), []) if _is_photo(path) else [])
+    alike = files.get(_plain(path.name)) or (files.get(_any_format(path), []) if is_photo(path) else [])
     return alike[0] if len(alike) == 1 else path
 
 
@@ -58,7 +58,7 @@ def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
     with suppress(PermissionError):  # opening the image says so
         for file in filter(is_file, folder.iterdir()):
             files.setdefault(_plain(file.name), []).append(file)
-            if _is_photo(file):
+            if is_photo(file):
                 files.setdefault(_any_format(file), []).append(file)
     return files
 
@@ -67,7 +67,8 @@ def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def _is_photo(file: Path) -> bool:
+def is_photo(file: Path) -> bool:
+    """Return whether a file's name is that of an image that is read here."""
     return file.suffix.lower() in SUFFIXES
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.scenes.blender import mask_folder
-from lapgs_plugin.scenes.images import SUFFIXES, has_alpha, image_size, read_image, same_shape
+from lapgs_plugin.scenes.images import SUFFIXES, has_alpha, image_size, is_photo, read_image, same_shape
 
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
@@ -55,7 +55,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     shorter = {name: name.removeprefix(common) for name in names}
     parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
     places = [place for parent in parents if is_folder(place := folder / parent)]
-    files = [file for place in places for file in place.iterdir() if file.suffix.lower() in SUFFIXES]
+    files = [file for place in places for file in place.iterdir() if is_photo(file)]
     present: dict[str, list[Path]] = {}
     for file in sorted(files):  # cameras write .JPG, other programs .jpg
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)

@@ -84,10 +84,10 @@ def check(shapes, cameras, count, height, width, absolute, limit):
             assert whole is found[0]
         assert all(each.is_contiguous() for each in found[:2])
 
-check([Shape(8, 1)], 2, 7, 5, 21, True, 1e-5)
-check([Shape()], 1, 60, 5, 21, False, 2e-5)
-check([Shape(8)], 2, 150, 7, 12, True, 2e-5)  # more pairs than are read at once
-check([Shape(2)], 1, 9, 18, 21, False, 2e-5)  # 32 regions in a tile
+check([Shape(8, 1)], 2, 7, 5, 21, True, 1e-5)  # worst seen 8.6e-7
+check([Shape()], 1, 60, 5, 21, False, 2e-5)  # worst seen 1.1e-6
+check([Shape(8)], 2, 150, 7, 12, True, 2e-5)  # more pairs than are read at once; worst seen 8.2e-6
+check([Shape(2)], 1, 9, 18, 21, False, 2e-5)  # 32 regions in a tile; worst seen 3.4e-6
 if DEVICE == "cuda":
     shapes = [Shape(*each) for each in ((), (4, 1), (2,), (8,), (8, 1), (16,))]
     # An alpha that is FAINTEST up to rounding may count in one of both; an H200 has 4.2e-6.

@@ -31,6 +31,8 @@ WARP = 32
 COLUMNS = 4
 LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
 """A warp's threads: this many columns of pixels by this many Gaussians."""
+AT_ONCE, QUEUE = tl.constexpr(2 * WARP), tl.constexpr(4 * WARP)
+"""Pairs that a warp reads at once, and places in its queue: for as many and almost a bucket."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
@@ -145,28 +147,15 @@ def _count_bits(x: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _product_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
-    """Return the product of `x` over the Gaussians before each along axis 1, and over all."""
+def _before(x: tl.tensor, adds: tl.constexpr) -> tuple[tl.tensor, tl.tensor]:
+    """Return the sum, or else the product, of `x` over the Gaussians before each along axis 1, and over all."""
     index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
-    before = tl.zeros_like(x) + 1.0
+    before = tl.zeros_like(x) if adds else tl.zeros_like(x) + 1.0
     for i in tl.static_range(5):
         if (1 << i) < SPLAT_LANES:
             other = _swapped(x, 1, 1 << i)
-            before = tl.where(index & (1 << i) != 0, before * other, before)
-            x *= other
-    return before, x
-
-
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _sum_before(x: tl.tensor) -> tuple[tl.tensor, tl.tensor]:
-    """Return the sum of `x` over the Gaussians before each along axis 1, and over all."""
-    index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
-    before = tl.zeros_like(x)
-    for i in tl.static_range(5):
-        if (1 << i) < SPLAT_LANES:
-            other = _swapped(x, 1, 1 << i)
-            before = tl.where(index & (1 << i) != 0, before + other, before)
-            x += other
+            before = tl.where(index & (1 << i) != 0, before + other if adds else before * other, before)
+            x = x + other if adds else x * other
     return before, x
 
 
@@ -213,6 +202,12 @@ def _region(
     return index, index // tiles, row, column
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _pairs_of(index: tl.tensor, offsets: tl.tensor, all_tiles: int, pairs: int) -> tuple[tl.tensor, tl.tensor]:
+    """Return the first pair of a tile, and the one after its last."""
+    return tl.load(offsets + index), tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+
+
 @triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # type: ignore[untyped-decorator]  # no types
 def _reach_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
@@ -223,8 +218,7 @@ def _reach_kernel(
     index = tl.program_id(0)
     row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
     regions: tl.constexpr = (tile // columns) * (tile // rows)
-    begin = tl.load(offsets + index)
-    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
     block = _first_word(index, begin, regions)
     thread = tl.arange(0, threads)
     while begin < stop:
@@ -254,8 +248,8 @@ def _first_word(index: tl.tensor, begin: tl.tensor, regions: tl.constexpr) -> tl
 def _pairs(
     begin: tl.tensor, stop: tl.tensor, flat: tl.tensor, words: tl.tensor, regions: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor]:
-    """Load the next 64 pairs: their Gaussians, and the words that say for each 32 which of them reach the region."""
-    pair = tl.arange(0, 64)
+    """Load the next `AT_ONCE` pairs: their Gaussians, and the words that say for each 32 which reach the region."""
+    pair = tl.arange(0, AT_ONCE)
     gaussian = tl.load(flat + begin + pair, begin + pair < stop, 0)
     return gaussian, tl.load(words + pair // 32 * regions, begin + pair // 32 * 32 < stop, 0)
 
@@ -269,23 +263,23 @@ def _fill(
     """Put Gaussians that reach the region in the queue, until it has a bucket of them or the pairs end.
 
     Args:
-        gaussian, word: of the next 64 pairs. Those after are loaded before they are needed, because loading takes as
-            long as blending many Gaussians.
+        gaussian, word: of the next `AT_ONCE` pairs. Those after are loaded before they are needed, because loading
+            takes as long as blending many Gaussians.
 
     Returns:
         The next pair and its word, how many Gaussians have entered the queue, and the next `gaussian` and `word`.
     """
-    pair = tl.arange(0, 64)
+    pair = tl.arange(0, AT_ONCE)
     while (begin < stop) & (tail - head < bucket):
         wanted = (word >> (pair % 32)) & 1
         before = _count_bits(word & ((1 << (pair % 32)) - 1))
         before += tl.where(pair < 32, 0, tl.sum(tl.where(pair < 32, wanted, 0), 0))
-        slot = (tail + before) & 127
+        slot = (tail + before) & (QUEUE - 1)
         tl.debug_barrier()  # all threads have read the bucket before
         tl.store(queue + slot, gaussian, wanted != 0)
         tail += tl.sum(wanted, 0)
-        begin += 64
-        words += 2 * regions
+        begin += AT_ONCE
+        words += AT_ONCE // 32 * regions
         gaussian, word = _pairs(begin, stop, flat, words, regions)
         tl.debug_barrier()  # threads read what others wrote
     return begin, words, tail, gaussian, word
@@ -303,7 +297,7 @@ def _bucket(
     # Which Gaussian of a bucket an element is; those in one thread are consecutive.
     order = tl.arange(0, SPLAT_LANES)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
     order = tl.broadcast_to(order, (LANES, SPLAT_LANES, splats, 1)) + head
-    gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & 127), tail > 0, another)
+    gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & (QUEUE - 1)), tail > 0, another)
     x, y, a, b = _load_four(records + record * gaussian)
     c, opacity, _, _ = _load_four(records + record * gaussian + 4)
     red, green, blue, _ = _load_four(records + record * gaussian + 8)
@@ -329,7 +323,7 @@ def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tens
     second = tl.arange(0, alpha.shape[2])[None, None, :, None] == 1  # of a thread's Gaussians
     by_both = tl.reduce(left, 2, _multiply, keep_dims=True)
     by_first = tl.reduce(tl.where(second, 1.0, left), 2, _multiply, keep_dims=True)
-    before, by_all = _product_before(by_both)
+    before, by_all = _before(by_both, adds=False)
     before *= transmittance
     after = before * tl.where(second, by_both, by_first)
     return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
@@ -353,11 +347,9 @@ def _forward_kernel(
     # Sums over the Gaussians of each thread.
     red, green, blue, cover = inside * 0.0, inside * 0.0, inside * 0.0, inside * 0.0
 
-    begin = tl.load(offsets + index)
-    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    another = tl.load(flat + begin, begin < stop, 0)
+    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
-    queue = queues + tl.program_id(0) * 128  # room for 64 pairs and almost a bucket
+    another, queue = tl.load(flat + begin, begin < stop, 0), queues + tl.program_id(0) * QUEUE
     gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0
     begin, words, tail, gaussians, word = _fill(
@@ -457,11 +449,10 @@ def _backward_kernel(
     transmittance = tl.where(inside, 1.0, 0.0)
     second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
-    begin, count = tl.load(offsets + index), tl.load(counts + tl.program_id(0))
-    stop = tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
-    another = tl.load(flat + begin, begin < stop, 0)
+    count = tl.load(counts + tl.program_id(0))
+    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
-    queue = queues + tl.program_id(0) * 128
+    another, queue = tl.load(flat + begin, begin < stop, 0), queues + tl.program_id(0) * QUEUE
     gaussians, word = _pairs(begin, stop, flat, words, regions)
     head, tail = 0, 0  # numbers of Gaussians that left the queue and that entered it
     while head < count:
@@ -482,7 +473,7 @@ def _backward_kernel(
         added = weight * (color_r * red + color_g * green + color_b * blue)
         by_both = tl.sum(added, 2, keep_dims=True)
         by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
-        added_before, by_all = _sum_before(by_both)
+        added_before, by_all = _before(by_both, adds=True)
         still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
         behind -= by_all
         # The gradient by alpha, times -alpha.
@@ -535,7 +526,7 @@ def blend_forward(
     images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
     _forward_kernel[(programs,)](
-        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, 4 * WARP),
+        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, QUEUE.value),
         *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
     )  # fmt: skip
@@ -568,7 +559,7 @@ def blend_backward(
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     _backward_kernel[(programs,)](
         records, offsets, flat, words, counts, images, by_images, found, others,
-        flat.new_empty(programs, 4 * WARP), *numbers,
+        flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
     )  # fmt: skip

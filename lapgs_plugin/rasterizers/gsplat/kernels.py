@@ -365,13 +365,13 @@ def visible_colors(
         neither means anything where culled; otherwise they are empty.
     """
     cameras, n = radii.shape[:2]
-    colors = means.new_empty(cameras, n, RECORD if packs else 3)
+    written = means.new_empty(cameras, n, RECORD if packs else 3)
     visible_radii = radii.new_empty(cameras, n if describes else 0)
     visible_pixels = means.new_empty(cameras, n if describes else 0, 2)
     _launch(
         _color_kernel,
         n,
-        (means, centre, sh, radii, *splats, colors, visible_radii, visible_pixels),
+        (means, centre, sh, radii, *splats, written, visible_radii, visible_pixels),
         (cameras, (degree + 1) ** 2, int(signed)),
         programs=cameras,
         coefficients=sh.shape[1],
@@ -380,8 +380,8 @@ def visible_colors(
         record=RECORD,
     )
     if not packs:
-        return colors, visible_radii, visible_pixels, means.new_empty(0)
-    return colors[..., COLOR_IN_RECORD : COLOR_IN_RECORD + 3], visible_radii, visible_pixels, colors
+        return written, visible_radii, visible_pixels, means.new_empty(0)
+    return written[..., COLOR_IN_RECORD : COLOR_IN_RECORD + 3], visible_radii, visible_pixels, written
 
 
 def write_to_stack(

@@ -64,20 +64,19 @@ class GsplatStack(FieldStack):
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
         viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
+        alphas: Tensor | None = None  # where the background is blended in already
         if self._starts[len(cameras)] == 0:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
             with torch.cuda.device(self._means.device):  # Triton launches on the current device
                 images = self._render_directly(cameras, viewmats, intrinsics, positions[0], background, (width, height))
-            pairs = zip(images, cameras, strict=True)
-            return [image[: camera.height, : camera.width].permute(2, 0, 1) for image, camera in pairs]
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
         rendered = []
         for i, camera in enumerate(cameras):
             image = images[i, : camera.height, : camera.width]  # (h, w, 3)
-            if background is not None and not self._signed[i]:
+            if alphas is not None and background is not None and not self._signed[i]:
                 image = torch.addcmul(image, 1 - alphas[i, : camera.height, : camera.width], background)
             rendered.append(image.permute(2, 0, 1))
         return rendered
