@@ -10,7 +10,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 512
 
@@ -78,4 +78,4 @@ def regularization_triton(
 
 def _launch(kernel: Any, given: tuple[Tensor, ...], weights: tuple[float, float]) -> None:
     n = len(given[0])
-    kernel[(triton.cdiv(n, BLOCK),)](*given, *weights, n, block=BLOCK, **FUSED)
+    launch(kernel, (blocks(n, BLOCK),), *given, *weights, n, block=BLOCK)
