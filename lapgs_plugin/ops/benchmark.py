@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -192,15 +193,15 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
         return Version(make(parameters), parameters[-1])
 
     def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
-        count = torch.zeros(())
+        count = itertools.count(1)
         slots = [
-            AdamSlot(one, gradient, torch.zeros_like(one), torch.zeros_like(one), count, 1e-3, 1e-3)
+            AdamSlot(one, gradient, torch.zeros_like(one), torch.zeros_like(one), 0, 1e-3, 1e-3)
             for one, gradient in zip(parameters, gradients, strict=True)
         ]
 
         def step() -> None:
-            count.add_(1)
-            step_torch(slots)
+            done = next(count)
+            step_torch([slot._replace(step=done) for slot in slots])
 
         return step
 

@@ -108,36 +108,33 @@ class TrainableField:
             sh_rest_factor: on the step size of SH above degree 0.
             scale: how the step differs from one for a single view.
         """
-        groups = [optimizer.param_groups[0] for optimizer in self.optimizers.values()]
-        self.optimizers["means"].param_groups[0]["lr"] = means_rate
+        means = self.optimizers["means"].param_groups[0]
+        means["lr"] = means_rate
         self._scale_rest_of_sh(sh_rest_factor)
-        rates = [group["lr"] for group in groups]
-        for group in groups:
-            group["lr"] *= scale.rate
-        self._step_scaled(active_coefficients, scale)
-        for (name, optimizer), rate in zip(self.optimizers.items(), rates, strict=True):
-            if name != "means":
-                optimizer.param_groups[0]["lr"] = rate
+        if isinstance(self.optimizers["means"], GpuFieldAdam):
+            step_together(list(self.optimizers.values()), scale)
+        else:
+            self._step_one_by_one(active_coefficients, scale)
+        means["lr"] = means_rate * scale.rate
         for param in self.params.values():
             param.grad = None  # faster than the optimizers' own `zero_grad`
 
-    def _step_scaled(self, active_coefficients: int | None, scale: StepScale) -> None:
-        """Make a `step` with the optimizers' present step sizes."""
+    def _step_one_by_one(self, active_coefficients: int | None, scale: StepScale) -> None:
         if isinstance(self.optimizers.get("sh"), FieldAdam):
             every = self.params["sh"].shape[1]
             self.optimizers["sh"].param_groups[0]["active_columns"] = active_coefficients or every
-        optimizers = list(self.optimizers.values())
-        if all(isinstance(optimizer, GpuFieldAdam) for optimizer in optimizers):
-            step_together(optimizers, scale)
-            return
         if scale.gradient != 1.0:
             torch._foreach_mul_([p.grad for p in self.params.values() if p.grad is not None], scale.gradient)
-        for optimizer in optimizers:
+        for optimizer in self.optimizers.values():
+            group = optimizer.param_groups[0]
+            rate = group["lr"]
+            group["lr"] = rate * scale.rate
             if isinstance(optimizer, FieldAdam):
-                optimizer.param_groups[0]["views"] = scale.views
+                group["views"] = scale.views
                 optimizer.step()
             else:
                 self._step_counting_views(optimizer, scale.views)
+            group["lr"] = rate
 
     def _step_counting_views(self, optimizer: Any, views: int) -> None:
         """Make a step for several views of PyTorch's or gsplat's Adam, whose betas and count are those of one view."""
@@ -199,7 +196,8 @@ class TrainableField:
 
     def optimizer_moments(self) -> dict[str, dict[str, Tensor]]:
         """Return Adam's state of every parameter by its name: step and both moments."""
-        return {name: dict(opt.state[self.params[name]]) for name, opt in self.optimizers.items()}
+        states = {name: optimizer.state[self.params[name]] for name, optimizer in self.optimizers.items()}
+        return {name: {key: torch.as_tensor(value) for key, value in state.items()} for name, state in states.items()}
 
     def adopt_moments(self, moments: dict[str, dict[str, Tensor]], kept: Tensor) -> None:
         """Continue with the Adam moments of rows `kept` (m,) of an earlier field: full inheritance.
@@ -209,10 +207,13 @@ class TrainableField:
         moments = _moments_of("sh" in self.optimizers, moments)
         for name, optimizer in self.optimizers.items():
             device = self.params[name].device
-            optimizer.state[self.params[name]] = {
+            state: dict[str, Any] = {
                 key: (value if key == "step" else value[kept]).to(device, copy=True)
                 for key, value in moments[name].items()
             }
+            if isinstance(optimizer, GpuFieldAdam):
+                state["step"] = float(moments[name]["step"])
+            optimizer.state[self.params[name]] = state
 
     def state(self) -> dict[str, Any]:
         """Return everything needed to continue later, as plain tensors."""

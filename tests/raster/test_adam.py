@@ -68,10 +68,9 @@ def test_equals_torch_adam_over_many_steps(shape: tuple[int, ...]) -> None:
 def stepped(values: list[Tensor], rates: tuple[float, float], views: int = 1) -> Tensor:
     """Return the tensor after a step of the PyTorch version on each gradient."""
     start = parameter(SH_SHAPE, torch.float64).detach()
-    slot = AdamSlot(start.clone(), *(torch.zeros_like(start) for _ in range(3)), torch.zeros(()), *rates)
-    for gradient in values:
-        slot.step.add_(views)
-        step_torch([slot._replace(gradient=gradient)], views)
+    slot = AdamSlot(start.clone(), *(torch.zeros_like(start) for _ in range(3)), 0, *rates)
+    for done, gradient in enumerate(values, start=1):
+        step_torch([slot._replace(gradient=gradient, step=done * views)], views)
     return slot.values
 
 

@@ -21,6 +21,7 @@ from lapgs_plugin.errors import (
 )
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.ops.adam import GpuFieldAdam
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
@@ -29,6 +30,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import backend
+from lapgs_plugin.training import model as model_module
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import check_storage
@@ -253,20 +255,20 @@ def test_a_base_with_fewer_harmonics_is_composed(scene: Scene, tmp_path: Path) -
     assert settings_from_manifest(archive.manifest).for_manifest() == settings.for_manifest()
 
 
-def test_moments_follow_sh_from_one_tensor_to_two_and_back() -> None:
+@pytest.mark.parametrize("adam", ["ours", "a GPU's"])
+def test_moments_follow_sh_from_one_tensor_to_two_and_back(adam: str, monkeypatch: pytest.MonkeyPatch) -> None:
     field = replace(blob_field(20), sh=torch.randn(20, 4, 3))
     in_one = stepped(TrainableField.create(field, LearningRates(), 4.0))
     in_two = TrainableField._in_two(field, LearningRates(), 4.0, sparse=False)
+    if adam == "a GPU's":
+        monkeypatch.setattr(model_module, "_cpu_adam", GpuFieldAdam)
     back = TrainableField.create(field, LearningRates(), 4.0)
     in_two.adopt_moments(in_one.optimizer_moments(), torch.arange(20))
     assert set(in_two.optimizer_moments()) == {"means", "quats", "scales", "opacities", "sh0", "shN"}
     back.adopt_moments(in_two.optimizer_moments(), torch.arange(20))
     for name, state in in_one.optimizer_moments().items():
         for key, value in state.items():
-            assert torch.equal(torch.as_tensor(back.optimizer_moments()[name][key]), torch.as_tensor(value)), (
-                name,
-                key,
-            )
+            assert torch.equal(back.optimizer_moments()[name][key], value), (name, key)
 
 
 def test_a_gpus_state_is_continued() -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +21,8 @@ from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
-from lapgs_plugin.ops.adam import ADAM_EPS, StepScale
+from lapgs_plugin.ops.adam import ADAM_EPS, GpuFieldAdam, StepScale
+from lapgs_plugin.ops.adam.in_torch import step_torch
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
@@ -29,6 +32,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.image_store import ImageStore
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import model as model_module
 from lapgs_plugin.training.densification import Densifier
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.saved_settings import settings_from_manifest
@@ -234,15 +238,18 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
 # -------------------------------------------------------------------------------------------------------- the steps
 
 
-@pytest.mark.parametrize("in_two", [False, True], ids=["ours", "torch's"])
-def test_steps_for_several_views_are_adams_with_scaled_rates(in_two: bool) -> None:
+@pytest.mark.parametrize("adam", ["ours", "torch's", "a GPU's"])
+def test_steps_for_several_views_are_adams_with_scaled_rates(adam: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Grendel's: rate times sqrt(v), betas to the power of v, epsilon over sqrt(v), by the mean of the gradients; with
     moments in units of the mean, here in those of one view. In float64, for v that changes from step to step."""
     field = replace(blob_field(30), sh=torch.randn(30, 4, 3, generator=torch.Generator().manual_seed(4)))
-    make = (lambda: TrainableField._in_two(field, LearningRates(), 4.0, False)) if in_two else (
-        lambda: TrainableField.create(field, LearningRates(), 4.0)
-    )  # fmt: skip
-    model = make()
+    if adam == "a GPU's":
+        monkeypatch.setattr(model_module, "_cpu_adam", GpuFieldAdam)
+        monkeypatch.setitem(sys.modules, "lapgs_plugin.ops.adam.in_triton", SimpleNamespace(step_triton=step_torch))
+    if adam == "torch's":
+        model = TrainableField._in_two(field, LearningRates(), 4.0, False)
+    else:
+        model = TrainableField.create(field, LearningRates(), 4.0)
     generator = torch.Generator().manual_seed(5)
     expected = {name: param.detach().double() for name, param in model.params.items()}
     first, second = ({name: torch.zeros_like(value) for name, value in expected.items()} for _ in range(2))

@@ -46,6 +46,8 @@ ONE_VIEW = StepScale()
 class GpuFieldAdam(torch.optim.Optimizer):
     """Hold Adam's state of one tensor, which gsplat's strategies edit; `step_together` steps it with the others.
 
+    'step' is a number: the processor knows it, and a GPU does not have to count.
+
     Args:
         param: (n, ...) float32, contiguous, on a CUDA device.
         lr: step size of the first three columns, or of all with a `rest_scale` of 1.
@@ -55,34 +57,33 @@ class GpuFieldAdam(torch.optim.Optimizer):
     def __init__(self, param: torch.nn.Parameter, lr: float, rest_scale: float = 1.0) -> None:
         super().__init__([param], {"lr": lr, "rest_scale": rest_scale})
         self.state[param] = {
-            "step": torch.zeros((), device=param.device),
+            "step": 0.0,
             "exp_avg": torch.zeros_like(param),
             "exp_avg_sq": torch.zeros_like(param),
         }
 
-    def slot(self) -> AdamSlot:
-        """Return the tensor and its state; without a gradient it moves by its momentum alone."""
+    def next_step(self, scale: StepScale) -> AdamSlot:
+        """Count a step and return what it needs; without a gradient the tensor moves by its momentum alone."""
         group = self.param_groups[0]
-        param, rate = group["params"][0], group["lr"]
+        param, rate = group["params"][0], group["lr"] * scale.rate
         gradient = torch.zeros_like(param) if param.grad is None else param.grad.contiguous()
         state = self.state[param]
+        state["step"] += scale.views
         moments = state["exp_avg"], state["exp_avg_sq"], state["step"]
         return AdamSlot(param, gradient, *moments, rate, rate * group["rest_scale"])
 
 
-@torch.no_grad()
 def step_together(optimizers: Sequence[GpuFieldAdam], scale: StepScale = ONE_VIEW) -> None:
     """Step the five tensors of a field in one kernel.
 
     Args:
-        optimizers: with their step sizes for this step.
-        scale: how the step differs from one for a single view; its `rate` is in the step sizes already.
+        optimizers: with their step sizes for a single view.
+        scale: how the step differs from one for a single view.
     """
     from lapgs_plugin.ops.adam.in_triton import step_triton
 
-    slots = [optimizer.slot() for optimizer in optimizers]
-    torch._foreach_add_([slot.step for slot in slots], scale.views)
-    if len(slots[0].values) > 0:
+    slots = [optimizer.next_step(scale) for optimizer in optimizers]
+    if slots[0].values.shape[0] > 0:
         step_triton(slots, scale.views, scale.gradient)
 
 
@@ -92,22 +93,20 @@ def triton_works(device: torch.device) -> float:
     generator = torch.Generator().manual_seed(0)
     shapes: list[tuple[int, ...]] = [(700, 3), (700, 4), (700, 3), (700,), (700, 16, 3)]
     starts = [torch.randn(shape, generator=generator).to(device) for shape in shapes]
+    found, expected = ([torch.nn.Parameter(start.clone()) for start in starts] for _ in range(2))
     optimizers, references = (
         [
-            GpuFieldAdam(torch.nn.Parameter(start.clone()), lr=i / 100, rest_scale=0.05 if start.ndim == 3 else 1.0)
-            for i, start in enumerate(starts, start=1)
+            GpuFieldAdam(param, lr=i / 100, rest_scale=0.05 if param.ndim == 3 else 1.0)
+            for i, param in enumerate(params, start=1)
         ]
-        for _ in range(2)
+        for params in (found, expected)
     )
-    for scale in (ONE_VIEW, ONE_VIEW, StepScale(views=4, gradient=0.5)):
-        for optimizer, reference, shape in zip(optimizers, references, shapes, strict=True):
-            gradient = torch.randn(shape, generator=generator).to(device)
-            for each in (optimizer, reference):
-                each.param_groups[0]["params"][0].grad = gradient
-            reference.slot().step.add_(scale.views)
+    for scale in (ONE_VIEW, ONE_VIEW, StepScale.of(4)):
+        for one, other in zip(found, expected, strict=True):
+            one.grad = other.grad = torch.randn(one.shape, generator=generator).to(device)
         step_together(optimizers, scale)
-        step_torch([reference.slot() for reference in references], scale.views, scale.gradient)
+        step_torch([reference.next_step(scale) for reference in references], scale.views, scale.gradient)
     return largest(
-        (reference.slot().values - optimizer.slot().values).abs() / (reference.slot().values - start).abs().max()
-        for reference, optimizer, start in zip(references, optimizers, starts, strict=True)
+        (one - other).abs() / (other - start).abs().max()
+        for one, other, start in zip(found, expected, starts, strict=True)
     )

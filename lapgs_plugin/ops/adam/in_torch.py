@@ -18,7 +18,7 @@ class AdamSlot(NamedTuple):
 
     Attributes:
         values, gradient, mean, square: (n, ...) the tensor, its gradient, Adam's first and second moment.
-        step: scalar, number of views optimized on, this step's included.
+        step: number of views optimized on, this step's included.
         rate: step size of the first three columns.
         rest: step size of all further columns.
     """
@@ -27,20 +27,20 @@ class AdamSlot(NamedTuple):
     gradient: Tensor
     mean: Tensor
     square: Tensor
-    step: Tensor
+    step: float
     rate: float
     rest: float
 
 
 @torch.no_grad()
 def step_torch(slots: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
-    """Step each tensor in place; `step` has been counted up already.
+    """Step each tensor in place.
 
     Args:
         views, gradient: of a `StepScale`.
     """
     for slot in slots:
-        (keep1, keep2), scaled, count = (beta**views for beta in BETAS), gradient * slot.gradient, float(slot.step)
+        (keep1, keep2), scaled, count = (beta**views for beta in BETAS), gradient * slot.gradient, slot.step
         slot.mean.mul_(keep1).add_(scaled, alpha=1 - keep1)
         slot.square.mul_(keep2).addcmul_(scaled, scaled, value=1 - keep2)
         row = slot.values.shape[1:]
