@@ -28,9 +28,9 @@ from lapgs_plugin.fields.rasterizer import (
     require_color,
 )
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD, our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
+from lapgs_plugin.rasterizers.gsplat.records import RECORD
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
 
@@ -174,8 +174,7 @@ class GsplatRasterizer(Rasterizer):
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
-        nothing = torch.empty(0, device=self._device)
-        direct = self._calls_kernels(*fields) and stacking_works() and our_kernels_blend(nothing)
+        direct = self._calls_kernels(*fields)
         return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
 
     def _calls_kernels(self, *fields: GaussianField, cameras: int = 1) -> bool:

@@ -25,13 +25,13 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
 from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
-from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
+from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras, cameras_on_device
+from lapgs_plugin.rasterizers.gsplat.records import RECORD
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
 class GsplatStack(FieldStack):
-    """Hold activated copies of fields on a device, concatenated in one tensor per parameter.
+    """Hold copies of fields on a device, concatenated in one tensor per parameter.
 
     Args:
         fields: float32, on any device. Later changes to them have no effect.
@@ -49,8 +49,11 @@ class GsplatStack(FieldStack):
         self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field, and the end
         self._means = _joined([field.means for field in fields], device)  # (n, 3)
         self._quaternions = _joined([field.quaternions for field in fields], device)  # (n, 4)
-        self._scales = _joined([field.log_scales for field in fields], device).exp_()  # (n, 3)
-        self._opacities = _joined([field.opacity_logits for field in fields], device).sigmoid_()  # (n,)
+        self._scales = _joined([field.log_scales for field in fields], device)  # (n, 3)
+        self._opacities = _joined([field.opacity_logits for field in fields], device)  # (n,)
+        if not direct:  # our kernels take them as they are
+            self._scales.exp_()
+            self._opacities.sigmoid_()
         self._sh = _joined([field.sh for field in fields], device)  # (n, k, 3)
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
@@ -69,7 +72,7 @@ class GsplatStack(FieldStack):
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         elif self._direct:
             with torch.cuda.device(self._means.device):  # Triton launches on the current device
-                images = self._render_directly(cameras, viewmats, intrinsics, positions[0], background, (width, height))
+                images = self._render_directly(cameras, viewmats, intrinsics, positions, background, (width, height))
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
@@ -85,29 +88,25 @@ class GsplatStack(FieldStack):
         return slice(self._starts[index], self._starts[index + 1])
 
     def _render_directly(
-        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor,
+        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, positions: Tensor,
         background: Tensor | None, size: tuple[int, int],
     ) -> Tensor:  # fmt: skip
-        """Return images (f, h, w, 3) of the first fields in two launches for each and three for all."""
+        """Return images (f, h, w, 3) of the first fields in one launch for each and three for all."""
         from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
-        from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
+        from lapgs_plugin.rasterizers.gsplat.kernels import Parameters, project_into
 
         count, like = self._starts[len(cameras)], self._means
         radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
         means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
+        stacked, positions = (radii, means2d, depths, records), positions.contiguous()
         for i, camera in enumerate(cameras):
-            means, quaternions, scales, opacities, sh = self._parts[i]
-            if len(means) == 0:
-                continue  # gsplat divides by their number
-            pose, matrix, own_size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
-            projected = bindings.project(means, quaternions, scales, opacities, pose, matrix, own_size)
-            stacked = radii, means2d, depths, records
-            write_to_stack(means, position, sh, opacities, self._signed[i], projected, stacked, self._starts[i])
+            given = Parameters(*self._parts[i])
+            if len(given.means) > 0:
+                on_device = DeviceCameras(viewmats, intrinsics, positions, camera.width, camera.height)
+                project_into(stacked, self._starts[i], given, on_device, i, self._signed[i])
         of_image = self._images[:count]
-        offsets, flat = bindings.sort_into_tiles([radii, means2d, depths], size, len(cameras), of_image)
-        behind = bindings.zeros(torch.Size((len(cameras), 3)), like.device)
-        if background is not None:
-            behind = self._unsigned[: len(cameras)] * background
+        offsets, flat = bindings.sort_into_tiles(stacked, size, len(cameras), of_image)
+        behind = self._unsigned[: len(cameras)] * (like.new_zeros(3) if background is None else background)
         return blend_forward(records, behind, offsets, flat, size)[0]
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
