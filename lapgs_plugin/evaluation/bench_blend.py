@@ -18,7 +18,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import bindings, direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD
+from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, Parameters
 from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
@@ -108,8 +108,6 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
 @torch.no_grad()
 def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     """Project a field on a GPU for some views, and sort it into tiles."""
-    from lapgs_plugin.rasterizers.gsplat.kernels import Parameters
-
     field = field.to("cuda")
     on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device="cuda")
     parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh

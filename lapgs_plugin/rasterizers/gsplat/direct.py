@@ -9,7 +9,7 @@ launches as one.
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,10 +19,8 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
+from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
-
-if TYPE_CHECKING:
-    from lapgs_plugin.rasterizers.gsplat.kernels import Parameters, Projected
 
 GradientTargets = list[weakref.ref[Tensor]]
 """Tensors to which a backward pass writes its gradients by centres and their absolute values, (n, 2) or (c, n, 2) each.
@@ -73,8 +71,6 @@ def _render(
         field, cameras, background, degree, absgrad: as `render` takes them.
         describes: fill in visible radii and centres, which are empty otherwise.
     """
-    from lapgs_plugin.rasterizers.gsplat.kernels import Parameters
-
     background = background.to(field.means).expand(len(cameras.poses), -1).contiguous()
     parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
     given = Parameters(*(value.contiguous() for value in parameters))  # kernels rely on it
@@ -121,8 +117,6 @@ class _Render(torch.autograd.Function):
         cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool, absgrad: bool,
         box: list[Projected], targets: GradientTargets,
     ) -> Tensor:  # fmt: skip
-        from lapgs_plugin.rasterizers.gsplat.kernels import Parameters
-
         given = Parameters(means, quaternions, log_scales, logits, sh)
         seen, tiles, blended = forward(given, cameras, background, degree, signed, describes)
         ctx.save_for_backward(*given, *cameras[:3], seen.radii, seen.records, *tiles, *blended)
@@ -135,7 +129,7 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_image: Tensor) -> tuple[Tensor | None, ...]:
         from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward
-        from lapgs_plugin.rasterizers.gsplat.kernels import Parameters, project_backward
+        from lapgs_plugin.rasterizers.gsplat.kernels import project_backward
 
         saved = ctx.saved_tensors
         given, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.size)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import triton
@@ -19,7 +18,7 @@ from torch import Tensor
 from lapgs_plugin.ops.self_check import FUSED
 from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, _load_four
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD
+from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 BLOCK = 128
@@ -359,6 +358,77 @@ def _project_kernel(
         placed += n
 
 
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _of_covariance(
+    wide: tl.tensor, skew: tl.tensor, high: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, visible: tl.tensor
+) -> tl.tensor:
+    """Return gradients by xx, by xy and yx each, and by yy of a covariance from those by its inverse (a, b, c).
+
+    They are minus the inverse, times the gradient by the inverse, times the inverse; 0 where nothing is visible.
+    """
+    half = 0.5 * skew
+    t00, t01, t10, t11 = a * wide + b * half, a * half + b * high, b * wide + c * half, b * half + c * high
+    return (
+        tl.where(visible, -(t00 * a + t01 * b), 0.0), tl.where(visible, -(t00 * b + t01 * c), 0.0),
+        tl.where(visible, -(t10 * b + t11 * c), 0.0),
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _of_place(
+    pose: tl.tensor, u: tl.tensor, v: tl.tensor, limited_u: tl.tensor, limited_v: tl.tensor, inverse: tl.tensor,
+    x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor,
+    fx: tl.tensor, fy: tl.tensor, fz: tl.tensor, gx: tl.tensor, gy: tl.tensor, gz: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return the gradient by a mean from those by its pixel, x and y, and by the projection's rows, halved, f and g.
+
+    The others are results of `_seen_from`.
+    """
+    r0, r1, r2 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
+    r4, r5, r6 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
+    r8, r9, r10 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
+    of_x_by_x, of_y_by_y = 2.0 * (fx * r0 + fy * r1 + fz * r2), 2.0 * (gx * r4 + gy * r5 + gz * r6)
+    of_x_by_z, of_y_by_z = 2.0 * (fx * r8 + fy * r9 + fz * r10), 2.0 * (gx * r8 + gy * r9 + gz * r10)
+    # The Jacobian's entries are f / z and -f u / z; where u is limited, it does not depend on the mean.
+    free_u, free_v = limited_u == u, limited_v == v
+    right = x_by_x * (of_x - tl.where(free_u, of_x_by_z * inverse, 0.0))
+    down = y_by_y * (of_y - tl.where(free_v, of_y_by_z * inverse, 0.0))
+    ahead = -x_by_x * (u * of_x + inverse * (of_x_by_x - tl.where(free_u, 2.0, 1.0) * limited_u * of_x_by_z))
+    ahead -= y_by_y * (v * of_y + inverse * (of_y_by_y - tl.where(free_v, 2.0, 1.0) * limited_v * of_y_by_z))
+    return (
+        r0 * right + r4 * down + r8 * ahead,
+        r1 * right + r5 * down + r9 * ahead,
+        r2 * right + r6 * down + r10 * ahead,
+    )
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _store_shape_gradients(
+    by_quaternion: tl.tensor, by_log_scale: tl.tensor, rows: tl.tensor, here: tl.tensor,
+    w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, length: tl.tensor,
+    s0: tl.tensor, s1: tl.tensor, s2: tl.tensor,
+    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
+) -> None:  # fmt: skip
+    """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances."""
+    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
+    # By the columns of the rotation, without their factor of twice the square of the scale.
+    ux, uy, uz = _times(xx, xy, xz, yy, yz, zz, a, d, g)
+    vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, b, e, h)
+    wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
+    s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
+    tl.store(by_log_scale + 3 * rows, s0 * (ux * a + uy * d + uz * g), here)
+    tl.store(by_log_scale + 3 * rows + 1, s1 * (vx * b + vy * e + vz * h), here)
+    tl.store(by_log_scale + 3 * rows + 2, s2 * (wx * c + wy * f + wz * i), here)
+    ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
+    of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
+    of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
+    of_y = 2.0 * (x * (vx + uy) - 2.0 * y * (ux + wz) + z * (wy + vz) + w * (wx - uz))
+    of_z = 2.0 * (x * (wx + uz) + y * (wy + vz) - 2.0 * z * (ux + vy) + w * (uy - vx))
+    along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
+    of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
+    _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
+
+
 @triton.jit(do_not_specialize=("width", "height", "n", "cameras"))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _shape_gradient_kernel(
     means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
@@ -376,7 +446,7 @@ def _shape_gradient_kernel(
     xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
     none = 0.0 * mean_x
     by_x, by_y, by_z, by_opacity = none, none, none, none
-    by_xx, by_xy, by_xz, by_yy, by_yz, by_zz = none, none, none, none, none, none  # with both halves of a symmetric one
+    by_xx, by_xy, by_xz, by_yy, by_yz, by_zz = none, none, none, none, none, none
     camera = 0
     while camera < cameras:
         placed = camera * n + row
@@ -389,14 +459,7 @@ def _shape_gradient_kernel(
         conic_c = tl.load(records + placed * record + 4)
         by_opacity += tl.where(visible, of_opacity, 0.0)
         of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
-        # Of the covariance in the image: minus its inverse, times the gradient by the inverse, times the inverse.
-        half = 0.5 * of_skew
-        t00, t01 = conic_a * of_wide + conic_b * half, conic_a * half + conic_b * of_high
-        t10, t11 = conic_b * of_wide + conic_c * half, conic_b * half + conic_c * of_high
-        wide = tl.where(visible, -(t00 * conic_a + t01 * conic_b), 0.0)
-        skew = tl.where(visible, -(t00 * conic_b + t01 * conic_c), 0.0)
-        high = tl.where(visible, -(t10 * conic_b + t11 * conic_c), 0.0)
-
+        wide, skew, high = _of_covariance(of_wide, of_skew, of_high, conic_a, conic_b, conic_c, visible)
         u, v, limited_u, limited_v, inverse, _, x_by_x, x_by_z, y_by_y, y_by_z = _seen_from(
             poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height
         )
@@ -412,43 +475,22 @@ def _shape_gradient_kernel(
         by_zz += fz * pz + gz * qz
         fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
-        pose = poses + 16 * camera
-        r0, r1, r2 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
-        r4, r5, r6 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
-        r8, r9, r10 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
-        of_x_by_x, of_y_by_y = 2.0 * (fx * r0 + fy * r1 + fz * r2), 2.0 * (gx * r4 + gy * r5 + gz * r6)
-        of_x_by_z, of_y_by_z = 2.0 * (fx * r8 + fy * r9 + fz * r10), 2.0 * (gx * r8 + gy * r9 + gz * r10)
-        # The Jacobian's entries are f / z and -f u / z; where u is limited, it does not depend on the mean.
-        free_u, free_v = limited_u == u, limited_v == v
-        right = x_by_x * (of_x - tl.where(free_u, of_x_by_z * inverse, 0.0))
-        down = y_by_y * (of_y - tl.where(free_v, of_y_by_z * inverse, 0.0))
-        ahead = -x_by_x * (u * of_x + inverse * (of_x_by_x - tl.where(free_u, 2.0, 1.0) * limited_u * of_x_by_z))
-        ahead -= y_by_y * (v * of_y + inverse * (of_y_by_y - tl.where(free_v, 2.0, 1.0) * limited_v * of_y_by_z))
-        by_x += r0 * right + r4 * down + r8 * ahead
-        by_y += r1 * right + r5 * down + r9 * ahead
-        by_z += r2 * right + r6 * down + r10 * ahead
+        right, down, ahead = _of_place(
+            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, fx, fy, fz, gx, gy, gz
+        )
+        by_x += right
+        by_y += down
+        by_z += ahead
         camera += 1
     tl.store(by_mean + 3 * rows, by_x, here)
     tl.store(by_mean + 3 * rows + 1, by_y, here)
     tl.store(by_mean + 3 * rows + 2, by_z, here)
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
     tl.store(by_logit + rows, by_opacity * opacity * (1.0 - opacity), here)
-    # By the columns of the rotation, without their factor of twice the square of the scale.
-    ux, uy, uz = _times(by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, a, d, g)
-    vx, vy, vz = _times(by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, b, e, h)
-    wx, wy, wz = _times(by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, c, f, i)
-    s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
-    tl.store(by_log_scale + 3 * rows, s0 * (ux * a + uy * d + uz * g), here)
-    tl.store(by_log_scale + 3 * rows + 1, s1 * (vx * b + vy * e + vz * h), here)
-    tl.store(by_log_scale + 3 * rows + 2, s2 * (wx * c + wy * f + wz * i), here)
-    ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
-    of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
-    of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
-    of_y = 2.0 * (x * (vx + uy) - 2.0 * y * (ux + wz) + z * (wy + vz) + w * (wx - uz))
-    of_z = 2.0 * (x * (wx + uz) + y * (wy + vz) - 2.0 * z * (ux + vy) + w * (uy - vx))
-    along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
-    of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
-    _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
+    _store_shape_gradients(
+        by_quaternion, by_log_scale, rows, here, w, x, y, z, length, s0, s1, s2,
+        by_xx, by_xy, by_xz, by_yy, by_yz, by_zz,
+    )  # fmt: skip
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -535,27 +577,6 @@ def _color_gradient_kernel(
         there = 3 * rows + channel
         moved = tl.where(channel == 0, of_x, tl.where(channel == 1, of_y, of_z))
         tl.store(by_mean + there, tl.load(by_mean + there, in_channel) + moved, in_channel)
-
-
-class Parameters(NamedTuple):
-    """Hold a field's parameters, contiguous float32 on one device."""
-
-    means: Tensor  # (n, 3)
-    quaternions: Tensor  # (n, 4)
-    log_scales: Tensor  # (n, 3)
-    logits: Tensor  # (n,)
-    sh: Tensor  # (n, k, 3)
-
-
-class Projected(NamedTuple):
-    """Hold n Gaussians as c cameras see them. Where culled, radii are 0, and only what is visible has a meaning."""
-
-    radii: Tensor  # (c, n, 2) int32, half sides of a footprint in pixels
-    means2d: Tensor  # (c, n, 2) in pixels
-    depths: Tensor  # (c, n)
-    records: Tensor  # (c, n, RECORD)
-    visible_radii: Tensor  # (c, n) int32 the larger of both, 0 where culled; empty unless described
-    centres: Tensor  # (c, n, 2) as in `RenderResult`; empty unless described
 
 
 def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:

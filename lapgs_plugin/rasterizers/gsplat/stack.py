@@ -26,7 +26,7 @@ from lapgs_plugin.fields.rasterizer import FieldStack
 from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras, cameras_on_device
-from lapgs_plugin.rasterizers.gsplat.records import RECORD
+from lapgs_plugin.rasterizers.gsplat.records import RECORD, Parameters
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
@@ -93,16 +93,17 @@ class GsplatStack(FieldStack):
     ) -> Tensor:  # fmt: skip
         """Return images (f, h, w, 3) of the first fields in one launch for each and three for all."""
         from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
-        from lapgs_plugin.rasterizers.gsplat.kernels import Parameters, project_into
+        from lapgs_plugin.rasterizers.gsplat.kernels import project_into
 
         count, like = self._starts[len(cameras)], self._means
         radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
         means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
-        stacked, positions = (radii, means2d, depths, records), positions.contiguous()
+        stacked = radii, means2d, depths, records
+        placed = [each.contiguous() for each in (viewmats, intrinsics, positions)]
         for i, camera in enumerate(cameras):
             given = Parameters(*self._parts[i])
             if len(given.means) > 0:
-                on_device = DeviceCameras(viewmats, intrinsics, positions, camera.width, camera.height)
+                on_device = DeviceCameras(placed[0], placed[1], placed[2], camera.width, camera.height)
                 project_into(stacked, self._starts[i], given, on_device, i, self._signed[i])
         of_image = self._images[:count]
         offsets, flat = bindings.sort_into_tiles(stacked, size, len(cameras), of_image)
