@@ -30,7 +30,7 @@ from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
 from lapgs_plugin.ops.position_noise.in_torch import add_noise_torch
-from lapgs_plugin.ops.regularization.in_torch import regularization_torch
+from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
@@ -236,15 +236,21 @@ def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Ver
 
 def _regularization_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
-    logits = torch.randn(gaussians, generator=generator).to(device).requires_grad_()
-    log_scales = torch.randn(gaussians, 3, generator=generator).to(device).requires_grad_()
+    starts = [torch.randn(gaussians, *columns, generator=generator).to(device) for columns in ((), (3,))]
 
-    def version(compute: Callable[[Tensor, Tensor, float, float], Tensor]) -> Version:
-        return Version(lambda: torch.autograd.grad(compute(logits, log_scales, 1.0, 1.0), (logits, log_scales))[1])
+    def in_torch(logits: Tensor, log_scales: Tensor, *weights: float) -> None:
+        assert logits.grad is not None
+        assert log_scales.grad is not None
+        add_regularization_torch(logits, log_scales, logits.grad, log_scales.grad, *weights)
 
-    versions = {TORCH: version(regularization_torch)}
+    def version(add: Callable[[Tensor, Tensor, float, float], None]) -> Version:
+        logits, log_scales = (start.clone() for start in starts)
+        logits.grad, log_scales.grad = torch.zeros_like(logits), torch.zeros_like(log_scales)
+        return Version(lambda: add(logits, log_scales, 1.0, 1.0), log_scales.grad)
+
+    versions = {TORCH: version(in_torch)}
     if ours != NUMBA and regularization.triton_works():
-        versions[ours] = version(regularization.regularization)
+        versions[ours] = version(regularization.add_regularization)
     return versions
 
 

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.ops.regularization import regularization
+from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Gradients, Strategy
@@ -90,11 +89,18 @@ class DensityControl:
             f"density control {type(self).__qualname__} has no method after_step; it has to edit a field"
         )
 
-    def regularization(self, field: GaussianField) -> Tensor | None:
-        """Return a term of the loss that makes unneeded Gaussians transparent and small; None if its weights are 0."""
-        if not (self._opacity_weight or self._scale_weight):
-            return None
-        return regularization(field.opacity_logits, field.log_scales, self._opacity_weight, self._scale_weight)
+    def regularize(self, model: TrainableField, views: int) -> None:
+        """Add the gradients of terms of the loss that depend on the parameters alone, after a step's backward passes.
+
+        Here they are those of the mean opacity and the mean size, which make unneeded Gaussians transparent and small.
+
+        Args:
+            model: whose parameters hold the gradients of the sum of the views' losses.
+            views: number of views of the step; the terms count for each.
+        """
+        if self._opacity_weight or self._scale_weight:
+            weights = views * self._opacity_weight, views * self._scale_weight
+            add_regularization(model.params["opacities"], model.params["scales"], *weights)
 
 
 def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> DensityControl:

@@ -226,6 +226,8 @@ class StageRun:
     def _step(self, iterations: range) -> None:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
         launches = self._run_launches(iterations)
+        self.breakdown.mark("backward")
+        self.densifier.regularize(self.model, len(iterations))
         last = iterations[-1]
         for launch in launches:
             self.progress.gaussian_steps += launch.gaussians * launch.views
@@ -308,11 +310,9 @@ class StageRun:
             result = replace(result, image=kept, transmittance=None)
         if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
             self._note_loss(kept.item(), last, len(views))
-        regularization = self.densifier.regularization(gaussians)
         self.breakdown.mark("backward")
-        total = loss if regularization is None else loss + regularization
         # The gradient of the sum of the views' losses; for one view, the default of `backward`.
-        total.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
+        loss.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -17,7 +16,7 @@ from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.training.densification import Densifier, DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview, Regularized, StagePart, Strategy
 from tests.training_scene import blob_field, ring_camera
 
@@ -81,22 +80,23 @@ def test_statistics_and_growth_are_gsplats(absgrad: bool) -> None:
 )
 def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, opacity: float, scale: float) -> None:
     field = blob_field(7)
-    field.opacity_logits.requires_grad_()
+    model = TrainableField.create(field, LearningRates(), EXTENT)
     settings = TrainSettings(iterations=100)
     (stage,) = StagePlan.create((64, 48), 100, 1)
     control = options.of_stage(StagePart()).density_control(StageSchedule.create(settings, stage), EXTENT)
-    term = control.regularization(field)
+    model.params["scales"].grad = torch.full((7, 3), 0.25)
+    control.regularize(model, 3)
+    gradients = [model.params[name].grad for name in ("opacities", "scales")]
     if opacity == scale == 0.0:
-        assert term is None
+        assert gradients[0] is None
+        assert (gradients[1] == 0.25).all()
         return
-    assert term is not None
-    opacities, sizes = 1 / (1 + np.exp(-field.opacity_logits.detach().numpy())), np.exp(field.log_scales.numpy())
-    # 2.0e-7 seen.
-    assert float(term.detach()) == pytest.approx(opacity * opacities.mean() + scale * sizes.mean(), rel=1e-6)
-    if opacity:
-        (gradient,) = torch.autograd.grad(term, field.opacity_logits)
-        expected = opacity * opacities * (1 - opacities) / len(field)
-        np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-5)  # 1.2e-6 seen
+    logits, log_scales = field.opacity_logits.double().requires_grad_(), field.log_scales.double().requires_grad_()
+    term = opacity * (1 / (1 + (-logits).exp())).sum() / 7 + scale * log_scales.exp().sum() / 21
+    expected = torch.autograd.grad(3 * term, (logits, log_scales), materialize_grads=True)
+    for found, wanted, before in zip(gradients, expected, (0.0, 0.25), strict=True):
+        assert found is not None
+        torch.testing.assert_close(found.double(), wanted + before, rtol=1e-6, atol=1e-9)
 
 
 def test_statistics_of_no_gaussians_are_empty() -> None:

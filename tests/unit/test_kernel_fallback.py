@@ -21,7 +21,7 @@ from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.ops.position_noise import add_noise
-from lapgs_plugin.ops.regularization import regularization
+from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.ops.self_check import SelfCheck
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
@@ -91,15 +91,19 @@ def moved() -> Pair:
 
 
 def regularized() -> Pair:
-    term = regularization(torch.tensor([0.0, 0.0]), torch.zeros(2, 3), 0.3, 0.25)
-    return term, torch.tensor(0.3 * 0.5 + 0.25)
+    logits, log_scales = torch.zeros(2), torch.zeros(2, 3)
+    logits.grad = torch.tensor([0.0, 1.0])
+    add_regularization(logits, log_scales, 0.3, 0.25)
+    assert log_scales.grad is not None
+    found = torch.cat([logits.grad, log_scales.grad.flatten()])
+    return found, torch.tensor([0.3 / 8, 1 + 0.3 / 8, *[0.25 / 6] * 6])
 
 
 @pytest.mark.parametrize(
     ("operation", "kernels", "compute", "instead"),
     [
         ("position_noise", ("add_noise_triton",), moved, "noise of positions in several operations"),
-        ("regularization", ("regularization_triton",), regularized, "regularization in several operations"),
+        ("regularization", ("add_regularization_triton",), regularized, "regularization in several operations"),
         ("photometric_loss", ("photometric_loss_triton",), loss, "the photometric loss in many operations"),
         ("densification_statistics", ("add_statistics_triton",), statistics, "densification statistics in several"),
         ("color_transform", ("transform_colors_triton",), colors, "colour transforms as products of matrices"),

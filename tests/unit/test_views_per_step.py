@@ -34,7 +34,7 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
-from lapgs_plugin.training.strategies import Gradients
+from lapgs_plugin.training.strategies import GRADIENTS, Gradients
 from tests.gsplat_on_cpu import GsplatOnCpu
 from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
@@ -296,6 +296,39 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_pat
     assert {count for count, _, _ in batching.asked} == {2, 3, 4}
     assert runs[0].manifest.complete
     assert runs[1].manifest.complete
+
+
+@pytest.mark.parametrize("holds", [4, 2])  # in one launch, and in two
+def test_regularization_counts_for_each_view_of_a_step(
+    holds: int, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, own = [], TrainableField.step
+
+    def step(model: TrainableField, *given: Any, **options: Any) -> None:
+        if StepScale.of(4) in given:
+            seen.append({name: (param.detach().clone(), param.grad.clone()) for name, param in model.params.items()})
+        own(model, *given, **options)
+
+    monkeypatch.setattr(TrainableField, "step", step)
+    for weight in (0.0, 0.25):
+        options = Gradients(opacity_regularization=weight, scale_regularization=2 * weight)
+        settings = replace(
+            SETTINGS, iterations=40, levels=1, gather=1, densification=Densification(GRADIENTS, options=options)
+        )
+        train(tmp_path / str(weight), scene, settings, Batching(holds))
+        found = seen[0]
+        seen.clear()
+        logits, log_scales = (found[name][0].double().requires_grad_() for name in ("opacities", "scales"))
+        term = weight * logits.sigmoid().mean() + 2 * weight * log_scales.exp().mean()
+        expected = torch.autograd.grad(4 * term, (logits, log_scales))
+        if weight == 0.0:
+            plain = found
+            continue
+        for name, wanted in zip(("opacities", "scales"), expected, strict=True):
+            assert torch.equal(found[name][0], plain[name][0])
+            added = found[name][1].double() - plain[name][1].double()
+            torch.testing.assert_close(added, wanted, rtol=1e-5, atol=1e-9)  # 4e-7 seen
+        assert torch.equal(found["means"][1], plain["means"][1])
 
 
 def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(scene: Scene, tmp_path: Path) -> None:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import triton
 import triton.language as tl
 
 from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 512
 EPS = tl.constexpr(ADAM_EPS)
@@ -54,16 +53,18 @@ def _move(
 @triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _kernel(
     values0: tl.tensor, gradients0: tl.tensor, means0: tl.tensor, squares0: tl.tensor, step0: tl.tensor,
-    rate0: float, rest0: float, columns0: tl.constexpr,
+    rate0: float, rest0: float,
     values1: tl.tensor, gradients1: tl.tensor, means1: tl.tensor, squares1: tl.tensor, step1: tl.tensor,
-    rate1: float, rest1: float, columns1: tl.constexpr,
+    rate1: float, rest1: float,
     values2: tl.tensor, gradients2: tl.tensor, means2: tl.tensor, squares2: tl.tensor, step2: tl.tensor,
-    rate2: float, rest2: float, columns2: tl.constexpr,
+    rate2: float, rest2: float,
     values3: tl.tensor, gradients3: tl.tensor, means3: tl.tensor, squares3: tl.tensor, step3: tl.tensor,
-    rate3: float, rest3: float, columns3: tl.constexpr,
+    rate3: float, rest3: float,
     values4: tl.tensor, gradients4: tl.tensor, means4: tl.tensor, squares4: tl.tensor, step4: tl.tensor,
-    rate4: float, rest4: float, columns4: tl.constexpr,
-    scale: float, k1: float, t1: float, k2: float, t2: float, n: int, block: tl.constexpr,
+    rate4: float, rest4: float,
+    scale: float, k1: float, t1: float, k2: float, t2: float, n: int,
+    columns0: tl.constexpr, columns1: tl.constexpr, columns2: tl.constexpr, columns3: tl.constexpr,
+    columns4: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     _move(values0, gradients0, means0, squares0, step0, rate0, rest0, scale, k1, t1, k2, t2, n, columns0, block)
     _move(values1, gradients1, means1, squares1, step1, rate1, rest1, scale, k1, t1, k2, t2, n, columns1, block)
@@ -76,8 +77,7 @@ def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
     """Do `step_torch` for the five float32 tensors of a field, n rows each, on one CUDA device."""
     n = len(slots[0].values)
     keep1, keep2 = (beta**views for beta in BETAS)
-    launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
-    launch(
-        *(value for slot in slots for value in (*slot, slot.values[:1].numel())),
-        gradient, keep1, 1 - keep1, keep2, 1 - keep2, n, block=BLOCK, **FUSED,
-    )  # fmt: skip
+    tensors = (value for slot in slots for value in slot)
+    columns = {f"columns{i}": slot.values.numel() // n for i, slot in enumerate(slots)}
+    numbers = gradient, keep1, 1 - keep1, keep2, 1 - keep2, n
+    launch(_kernel, (blocks(n, BLOCK),), *tensors, *numbers, **columns, block=BLOCK)

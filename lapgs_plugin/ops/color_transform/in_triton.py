@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 1024
 SIZES = ("n", "by_view", "by_channel", "out_view", "out_channel")
@@ -23,8 +23,8 @@ SIZES = ("n", "by_view", "by_channel", "out_view", "out_channel")
 
 @triton.jit(do_not_specialize=SIZES[:3])  # type: ignore[untyped-decorator]  # Triton ships no types
 def _apply(
-    image: tl.tensor, transform: tl.tensor, out: tl.tensor, n: int, by_view: int, by_channel: int, by_pixel: int,
-    block: tl.constexpr,
+    image: tl.tensor, transform: tl.tensor, out: tl.tensor, n: int, by_view: int, by_channel: int,
+    by_pixel: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     view = tl.program_id(1)
     places = tl.program_id(0) * block + tl.arange(0, block)
@@ -42,8 +42,8 @@ def _apply(
 @triton.jit(do_not_specialize=SIZES)  # type: ignore[untyped-decorator]  # Triton ships no types
 def _gradients(
     image: tl.tensor, transform: tl.tensor, by_out: tl.tensor, by_image: tl.tensor, by_transform: tl.tensor, n: int,
-    by_view: int, by_channel: int, by_pixel: int, out_view: int, out_channel: int, out_pixel: int,
-    block: tl.constexpr,
+    by_view: int, by_channel: int, out_view: int, out_channel: int,
+    by_pixel: tl.constexpr, out_pixel: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     view = tl.program_id(1)
     places = tl.program_id(0) * block + tl.arange(0, block)
@@ -78,8 +78,9 @@ class _Transformed(torch.autograd.Function):
         views, _, n = image.shape
         out = torch.empty_like(image)
         assert out.stride() == image.stride(), "images without gaps"
-        launch: Any = _apply[(triton.cdiv(n, BLOCK), views)]
-        launch(image, transform, out, n, *image.stride(), block=BLOCK, **FUSED)
+        *strides, by_pixel = image.stride()
+        programs = blocks(n, BLOCK), views
+        launch(_apply, programs, image, transform, out, n, *strides, by_pixel=by_pixel, block=BLOCK)
         return out
 
     @staticmethod
@@ -88,9 +89,12 @@ class _Transformed(torch.autograd.Function):
         image, transform = ctx.saved_tensors
         views, _, n = image.shape
         by_image, by_transform = torch.empty_like(image), torch.zeros_like(transform)
-        launch: Any = _gradients[(triton.cdiv(n, BLOCK), views)]
-        strides = *image.stride(), *by_out.stride()
-        launch(image, transform, by_out, by_image, by_transform, n, *strides, block=BLOCK, **FUSED)
+        (*strides, by_pixel), (*out_strides, out_pixel) = image.stride(), by_out.stride()
+        launch(
+            _gradients, (blocks(n, BLOCK), views),
+            image, transform, by_out, by_image, by_transform, n, *strides, *out_strides,
+            by_pixel=by_pixel, out_pixel=out_pixel, block=BLOCK,
+        )  # fmt: skip
         return by_image, by_transform
 
 

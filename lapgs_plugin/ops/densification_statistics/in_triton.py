@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 512
 
@@ -39,6 +37,5 @@ def add_statistics_triton(
 ) -> None:
     """Do `add_statistics` for contiguous float32 tensors on one CUDA device."""
     n = len(norms)
-    launch: Any = _kernel[(triton.cdiv(n, BLOCK),)]
     halves, views = (size[0] / 2.0, size[1] / 2.0), radii.numel() // n
-    launch(gradient, radii, norms, counts, *halves, n, views, block=BLOCK, **FUSED)
+    launch(_kernel, (blocks(n, BLOCK),), gradient, radii, norms, counts, *halves, n, views, block=BLOCK)

@@ -16,15 +16,15 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from lapgs_plugin.ops.launch import blocks, launch
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
-from lapgs_plugin.ops.self_check import FUSED
 
 COLORS = 3
 BLOCK = 128
 MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 16, 1500
 """Rows of a program, which reads ten more. It takes fewer where an image would make less than so many programs."""
 
-CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK, **FUSED}
+CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.
@@ -70,9 +70,8 @@ def _ssim(
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
-    x_image: int, x_plane: int, x_row: int, x_column: tl.constexpr,
-    y_image: int, y_plane: int, y_row: int, y_column: tl.constexpr,
-    c1: tl.constexpr, c2: tl.constexpr, interleaved: tl.constexpr,
+    x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
+    x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, interleaved: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the derivatives of SSIM by the local means of x, x squared and x y, and add to the loss.
@@ -139,8 +138,8 @@ def _gradient_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor,
     by_loss: tl.tensor, gradient: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
-    x_image: int, x_plane: int, x_row: int, x_column: tl.constexpr,
-    y_image: int, y_plane: int, y_row: int, y_column: tl.constexpr, interleaved: tl.constexpr,
+    x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
+    x_column: tl.constexpr, y_column: tl.constexpr, interleaved: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the gradient by x, with the strides of x; arguments as `_loss_kernel` takes them."""
@@ -197,10 +196,9 @@ class _PhotometricLoss(torch.autograd.Function):
         assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
         maps = [torch.empty_like(prediction) for _ in range(3)]
         assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
-        grid, sizes = _grid(prediction, target, ssim_weight)
-        constants = {"c1": SSIM_C1, "c2": SSIM_C2, **CONSTANTS}
-        launch: Any = _loss_kernel[grid]
-        launch(prediction, target, *maps, total, *sizes, interleaved=prediction.stride(1) == 1, **constants)
+        programs, sizes, columns = _launch_of(prediction, target, ssim_weight)
+        constants = {**columns, "c1": SSIM_C1, "c2": SSIM_C2, **CONSTANTS}
+        launch(_loss_kernel, programs, prediction, target, *maps, total, *sizes, **constants)
         ctx.save_for_backward(prediction, target, *maps)
         ctx.ssim_weight = ssim_weight
         return total
@@ -210,26 +208,27 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
         prediction, target, *maps = ctx.saved_tensors
         gradient = torch.empty_like(prediction)
-        grid, sizes = _grid(prediction, target, ctx.ssim_weight)
-        launch: Any = _gradient_kernel[grid]
-        given = prediction, target, *maps, by_loss, gradient, *sizes
-        launch(*given, interleaved=prediction.stride(1) == 1, **CONSTANTS)
+        programs, sizes, columns = _launch_of(prediction, target, ctx.ssim_weight)
+        launch(_gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, *sizes, **columns, **CONSTANTS)
         return gradient, None, None
 
 
-def _grid(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[tuple[int, int, int], tuple[Any, ...]]:
-    """Return the programs of a launch, and the arguments that both kernels share."""
+def _launch_of(
+    prediction: Tensor, target: Tensor, ssim_weight: float
+) -> tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]:
+    """Return the programs of a launch, and the numbers and constants that both kernels share."""
     b, _, h, w = prediction.shape
-    strips = triton.cdiv(triton.cdiv(w, 2) * COLORS, BLOCK)
+    strips = blocks(blocks(w, 2) * COLORS, BLOCK)
     rows = MOST_ROWS
-    while rows > LEAST_ROWS and strips * triton.cdiv(h, rows) * b < ENOUGH_PROGRAMS:
+    while rows > LEAST_ROWS and strips * blocks(h, rows) * b < ENOUGH_PROGRAMS:
         rows //= 2
     each = 1 / prediction.numel()
     scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
     weights = (1 - ssim_weight) * each, ssim_weight * each
-    return (strips, triton.cdiv(h, rows), b), (
-        *(h, w, rows, scale, *weights), *prediction.stride(), *target.stride(),
-    )  # fmt: skip
+    (*x_strides, x_column), (*y_strides, y_column) = prediction.stride(), target.stride()
+    numbers = h, w, rows, scale, *weights, *x_strides, *y_strides
+    columns = {"x_column": x_column, "y_column": y_column, "interleaved": prediction.stride(1) == 1}
+    return (strips, blocks(h, rows), b), numbers, columns
 
 
 def photometric_loss_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:

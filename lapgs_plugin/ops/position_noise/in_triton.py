@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.ops.launch import blocks, launch
 from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS
-from lapgs_plugin.ops.self_check import FUSED
 
 BLOCK = 256
 
@@ -55,6 +53,5 @@ def add_noise_triton(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, noise: Tensor, amount: float
 ) -> None:
     """Do `add_noise` for contiguous float32 tensors on one CUDA device."""
-    launch: Any = _kernel[(triton.cdiv(len(means), BLOCK),)]
-    given = means, quaternions, log_scales, opacity_logits, noise
-    launch(*given, amount, len(means), sharpness=SHARPNESS, faint=FAINT, block=BLOCK, **FUSED)
+    n, given = len(means), (means, quaternions, log_scales, opacity_logits, noise)
+    launch(_kernel, (blocks(n, BLOCK),), *given, amount, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)

@@ -1,39 +1,55 @@
-"""A term of the loss that makes unneeded Gaussians transparent and small (Kheradmand et al. 2024)."""
+"""Make unneeded Gaussians transparent and small (Kheradmand et al. 2024): gradients of their mean opacity and size."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.regularization.in_torch import regularization_torch
+from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
-def regularization(opacity_logits: Tensor, log_scales: Tensor, opacity_weight: float, scale_weight: float) -> Tensor:
-    """Return the weighted sum of the mean opacity and the mean size, a number.
+@torch.no_grad()
+def add_regularization(opacity_logits: Tensor, log_scales: Tensor, opacity_weight: float, scale_weight: float) -> None:
+    """Add the gradients of the weighted sum of the mean opacity and the mean size to those of two parameters.
 
     Args:
-        opacity_logits: (n,).
-        log_scales: (n, 3).
+        opacity_logits: (n,) contiguous, with a gradient or none yet.
+        log_scales: (n, 3), as well.
         opacity_weight, scale_weight: from 0.
     """
-    if len(opacity_logits) and triton_works(opacity_logits, log_scales):
-        from lapgs_plugin.ops.regularization.in_triton import regularization_triton
+    if len(opacity_logits) == 0:
+        return
+    by_logits, by_log_scales = _gradient(opacity_logits), _gradient(log_scales)
+    if triton_works(opacity_logits, log_scales):
+        from lapgs_plugin.ops.regularization.in_triton import add_regularization_triton
 
-        return regularization_triton(opacity_logits, log_scales, opacity_weight, scale_weight)
-    return regularization_torch(opacity_logits, log_scales, opacity_weight, scale_weight)
+        add_regularization_triton(opacity_logits, log_scales, by_logits, by_log_scales, opacity_weight, scale_weight)
+    else:
+        add_regularization_torch(opacity_logits, log_scales, by_logits, by_log_scales, opacity_weight, scale_weight)
 
 
-@matches_reference("regularization in several operations instead of two kernels", 1e-5)
+def _gradient(parameter: Tensor) -> Tensor:
+    """Return the gradient of a parameter, contiguous, to add to."""
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter)
+    elif not parameter.grad.is_contiguous():
+        parameter.grad = parameter.grad.contiguous()
+    return parameter.grad
+
+
+@matches_reference("regularization in several operations instead of one kernel", 1e-5)
 def triton_works(device: torch.device) -> float:
-    """Compare the number and its gradients, relative to the largest."""
-    from lapgs_plugin.ops.regularization.in_triton import regularization_triton
+    """Compare with the gradients of the formula, relative to the largest."""
+    from lapgs_plugin.ops.regularization.in_triton import add_regularization_triton
 
     generator = torch.Generator().manual_seed(0)
-    found = []
-    logits, log_scales = (torch.randn(700, *columns, generator=generator).to(device) for columns in ((), (3,)))
-    for compute in (regularization_triton, regularization_torch):
-        leaves = [each.clone().requires_grad_() for each in (logits, log_scales)]
-        value = compute(leaves[0], leaves[1], 0.3, 0.2)
-        found.append([value.detach(), *torch.autograd.grad(3.0 * value, leaves)])
-    return largest((one - other).abs() / other.abs().max() for one, other in zip(*found, strict=True))
+    logits, log_scales, *before = (
+        torch.randn(700, *columns, generator=generator).to(device) for columns in ((), (3,), (), (3,))
+    )
+    found = [each.clone() for each in before]
+    add_regularization_triton(logits, log_scales, found[0], found[1], 300.0, 200.0)
+    leaves = [logits.requires_grad_(), log_scales.requires_grad_()]
+    term = 300.0 * logits.sigmoid().mean() + 200.0 * log_scales.exp().mean()
+    expected = [added + begun for added, begun in zip(torch.autograd.grad(term, leaves), before, strict=True)]
+    return largest((one - other).abs() / other.abs().max() for one, other in zip(found, expected, strict=True))

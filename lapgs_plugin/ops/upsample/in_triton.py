@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 128
 MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 8, 1500
@@ -21,7 +21,7 @@ MOST_TAPS, MOST_TRANSPOSED = 5, 12
 """Upper bounds: coarse samples in the sum of a fine one, and fine samples whose sums a coarse one is in."""
 
 # Triton compiles a kernel again for integers that are 1 or multiples of 16. Without this it would do so for many image
-# sizes. Column strides stay specialized: they are 1 or 3, and a known 1 makes faster code.
+# sizes.
 OF_ANY_VALUE = (
     *("height", "width", "rows", "source_image", "source_plane", "source_row"),
     *("added_image", "added_plane", "added_row", "out_image", "out_plane", "out_row"),
@@ -42,9 +42,9 @@ def _kernel(
     source: tl.tensor, added: tl.tensor, out: tl.tensor,
     first_row: tl.tensor, row_weights: tl.tensor, first_column: tl.tensor, column_weights: tl.tensor,
     height: int, width: int, rows: int,
-    source_image: int, source_plane: int, source_row: int, source_column: int,
-    added_image: int, added_plane: int, added_row: int, added_column: int,
-    out_image: int, out_plane: int, out_row: int, out_column: int,
+    source_image: int, source_plane: int, source_row: int, added_image: int, added_plane: int, added_row: int,
+    out_image: int, out_plane: int, out_row: int,
+    source_column: tl.constexpr, added_column: tl.constexpr, out_column: tl.constexpr,
     adds: tl.constexpr, clamps: tl.constexpr, planes: tl.constexpr, interleaved: tl.constexpr,
     taps_down: tl.constexpr, taps_across: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
@@ -143,15 +143,17 @@ def _filter(
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
     b, planes, height, width = images[2].shape
-    strips, count = triton.cdiv(planes * width, BLOCK), MOST_ROWS
-    while count > LEAST_ROWS and strips * triton.cdiv(height, count) * b < ENOUGH_PROGRAMS:
+    strips, count = blocks(planes * width, BLOCK), MOST_ROWS
+    while count > LEAST_ROWS and strips * blocks(height, count) * b < ENOUGH_PROGRAMS:
         count //= 2
-    launch: Any = _kernel[strips, triton.cdiv(height, count), b]
+    source_column, added_column, out_column = (image.stride(3) for image in images)
     launch(
+        _kernel, (strips, blocks(height, count), b),
         *images, *rows, *columns, height, width, count,
-        *(stride for image in images for stride in image.stride()),
+        *(stride for image in images for stride in image.stride()[:3]),
+        source_column=source_column, added_column=added_column, out_column=out_column,
         adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
-        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK, **FUSED,
+        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
     )  # fmt: skip
 
 

@@ -1,0 +1,109 @@
+"""Start Triton kernels with less work for the processor than Triton's own launch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import triton
+from torch import Tensor
+
+from lapgs_plugin.ops.self_check import FUSED
+
+try:
+    from triton import knobs
+
+    HOOKS: Any = knobs.runtime
+except ImportError:  # before Triton 3.4
+    from triton.compiler import CompiledKernel
+
+    HOOKS = CompiledKernel
+
+# Triton does not promise how a compiled kernel is started. These versions do it in the same way, for NVIDIA's GPUs.
+VERSION = tuple(map(int, triton.__version__.split(".")[:2]))
+STARTS_DIRECTLY = (3, 0) <= VERSION <= (3, 6) and torch.version.hip is None
+
+Start = Callable[..., None]
+_starts: dict[tuple[Any, ...], Start | None] = {}  # None for what only Triton starts
+
+
+def launch(kernel: Any, programs: tuple[int, ...], *arguments: Tensor | float, **constants: Any) -> None:
+    """Start a kernel on the current device and stream.
+
+    Triton looks for the compiled kernel by all that it is compiled for, which takes longer than many kernels run. Here
+    the types of the arguments suffice, as long as tensors begin at multiples of 16 bytes and numbers fit in 32 bits.
+    Triton starts all other kernels itself.
+
+    Args:
+        kernel: with parameters that are not `tl.constexpr` first. Integers among them are in `do_not_specialize`, else
+            Triton starts it.
+        programs: their number in one, two or three dimensions.
+        arguments: tensors on the current device, and numbers.
+        constants: all others, by name, each always of the same type; and Triton's options. `FUSED` is set.
+    """
+    start = _start_of(kernel, arguments, constants) if STARTS_DIRECTLY else None
+    if start is None:
+        kernel[programs](*arguments, **constants, **FUSED)
+    else:
+        start(programs, arguments)
+
+
+def _start_of(kernel: Any, arguments: tuple[Tensor | float, ...], constants: dict[str, Any]) -> Start | None:
+    """Return what starts a kernel for arguments like these; None if Triton has to."""
+    if not isinstance(kernel, triton.JITFunction) or _heard(HOOKS.launch_enter_hook) or _heard(HOOKS.launch_exit_hook):
+        return None
+    places = 0
+    kinds: list[Any] = []
+    for argument in arguments:
+        if isinstance(argument, Tensor):
+            places |= argument.data_ptr()
+            kinds.append(argument.dtype)
+        elif -(2**31) <= argument < 2**31:
+            kinds.append(type(argument))
+        else:
+            return None
+    if places % 16 != 0:
+        return None
+    device = triton.runtime.driver.active.get_current_device()
+    key = (kernel.fn, device, *kinds, *constants, *constants.values())
+    try:
+        return _starts[key]
+    except KeyError:
+        _starts[key] = _compiled(kernel, device, arguments, constants)
+        return _starts[key]
+
+
+def _heard(hook: Any) -> bool:
+    """Return whether somebody, such as a profiler, is told of launches: a function, or several of them."""
+    return bool(getattr(hook, "calls", hook))
+
+
+def _compiled(
+    kernel: Any, device: int, arguments: tuple[Tensor | float, ...], constants: dict[str, Any]
+) -> Start | None:
+    """Compile a kernel, and return what starts it; None if Triton has to."""
+    parameters = kernel.params[: len(arguments)]
+    specialized = [
+        isinstance(argument, int) and not parameter.do_not_specialize
+        for parameter, argument in zip(parameters, arguments, strict=True)
+    ]
+    if any(specialized) or any(parameter.is_constexpr for parameter in parameters):
+        return None
+    compiled = kernel.warmup(*arguments, grid=(1,), **constants, **FUSED)
+    run, function, metadata = compiled.run, compiled.function, compiled.packed_metadata
+    names = kernel.arg_names[len(arguments) :]
+    # Before Triton 3.3 constants are not passed on.
+    last = [constants[name] for name in names] if len(compiled.src.signature) == len(kernel.params) else []
+    stream_of = triton.runtime.driver.active.get_current_stream
+
+    def start(programs: tuple[int, ...], arguments: tuple[Tensor | float, ...]) -> None:
+        x, y, z = (*programs, 1, 1)[:3]
+        run(x, y, z, stream_of(device), function, metadata, None, None, None, *arguments, *last)
+
+    return start
+
+
+def blocks(count: int, block: int) -> int:
+    """Return how many blocks hold `count` numbers. It takes a fraction of the time of `triton.cdiv`."""
+    return -(-count // block)
