@@ -101,6 +101,7 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import bindings
+from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from tests.gsplat_on_cpu import Compiled, GsplatOnCpu, gsplat_on_cpu
 
@@ -142,10 +143,8 @@ with pytest.MonkeyPatch.context() as patch, gsplat_on_cpu():
             close(*found)
     fields = [field(60, True), field(40, False)]
     for cameras, background in (([camera, camera.resized(12, 10)], some), ([camera], None)):
-        close(*(
-            GsplatStack(fields, torch.device("cpu"), direct=direct).render(cameras, background)
-            for direct in (True, False)
-        ))
+        stacks = DirectStack(fields, torch.device("cpu")), GsplatStack(fields, torch.device("cpu"))
+        close(*(stack.render(cameras, background) for stack in stacks))
 """
 
 

@@ -23,7 +23,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import launch
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
 from lapgs_plugin.rasterizers.gsplat.records import GRADIENT, RECORD
 
@@ -501,17 +501,19 @@ def blend_forward(
     width, height = size
     programs, numbers = _launch_of(offsets, flat, size, shape)
     words = flat.new_empty((len(flat) // WARP + offsets.numel()) * shape.regions)
-    _reach_kernel[(offsets.numel(),)](
+    launch(
+        _reach_kernel, (offsets.numel(),),
         records, offsets, flat, words, *numbers[2:],
         columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
-        num_warps=REACH_WARPS, **FUSED,
+        num_warps=REACH_WARPS,
     )  # fmt: skip
     images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
-    _forward_kernel[(programs,)](
+    launch(
+        _forward_kernel, (programs,),
         records, background, offsets, flat, words, images, counts, flat.new_empty(programs, QUEUE.value),
         *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
+        num_warps=1, maxnreg=FORWARD_REGISTERS,
     )  # fmt: skip
     return images, counts, words
 
@@ -539,11 +541,12 @@ def blend_backward(
     count, each = records.numel() // RECORD, 3 if absolute else 1
     zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
-    _backward_kernel[(programs,)](
+    launch(
+        _backward_kernel, (programs,),
         records, offsets, flat, words, counts, images, by_images, found, others,
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
+        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS,
     )  # fmt: skip
     leading = records.shape[:-1]
     return found.view(*leading, GRADIENT), others.view(*leading, each)

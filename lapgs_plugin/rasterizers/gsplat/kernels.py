@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import blocks, launch
 from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, _load_four
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
@@ -618,9 +618,10 @@ def _project(
     start: int, describes: bool,
 ) -> None:  # fmt: skip
     n = len(given.means)
-    _project_kernel[(triton.cdiv(n, BLOCK),)](
+    launch(
+        _project_kernel, (blocks(n, BLOCK),),
         *given, *cameras[:3], *into, cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start,
-        coefficients=given.sh.shape[1], describes=describes, record=RECORD, block=BLOCK, **FUSED,
+        coefficients=given.sh.shape[1], describes=describes, record=RECORD, block=BLOCK,
     )  # fmt: skip
 
 
@@ -637,15 +638,17 @@ def project_backward(
     """
     by = Parameters(*(torch.empty_like(value) for value in given))
     n, count, coefficients = len(given.means), len(cameras.poses), given.sh.shape[1]
-    _shape_gradient_kernel[(triton.cdiv(n, BLOCK),)](
+    launch(
+        _shape_gradient_kernel, (blocks(n, BLOCK),),
         *given[:4], *cameras[:2], radii, records, found, others, *by[:4], cameras.width, cameras.height, n, count,
-        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, **FUSED,
+        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK,
     )  # fmt: skip
     block = BLOCK // 4  # one channel of a Gaussian for each thread
-    _color_gradient_kernel[(triton.cdiv(n, block),)](
+    launch(
+        _color_gradient_kernel, (blocks(n, block),),
         given.means, cameras.centres, given.sh, radii, records, found, by.means, by.sh,
         n, count, (degree + 1) ** 2, int(signed),
         record=RECORD, color_in_record=COLOR_IN_RECORD, gradient=GRADIENT,
-        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=block, **FUSED,
+        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=block,
     )  # fmt: skip
     return by
