@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,9 @@ from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.rasterizers.gsplat import bindings
+from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected, records_of
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -225,54 +228,89 @@ class Compiled:
         return _checked(name)
 
 
-class Finishing:
-    """The functions of `gsplat.kernels` that a training render calls, in PyTorch's operations and by autograd."""
+def _looks(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool) -> tuple[Tensor, Tensor]:
+    """Colours (c, n, 3) and opacities (c, n)."""
+    away = [torch.nn.functional.normalize(given.means - centre, dim=-1) for centre in cameras.centres]
+    colors = torch.stack([sh_to_color(given.sh, each, degree, signed=signed) for each in away])
+    return colors, given.logits.sigmoid().expand(len(away), -1)
 
-    @staticmethod
-    def activate(log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        return log_scales.exp(), logits.sigmoid()
 
-    @staticmethod
-    def visible_colors(
-        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, describes: bool,
-        splats: tuple[Tensor, Tensor, Tensor], packs: bool,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-        assert not packs, "records are for our kernels that blend, which need a GPU"
-        shown = (radii > 0).all(-1)  # (c, n)
-        values = torch.stack(
-            [sh_to_color(sh, torch.nn.functional.normalize(means - c, dim=-1), degree, signed=signed) for c in centre]
+def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
+    """As `kernels.project`, in PyTorch's operations."""
+    radii, means2d, depths, conics, _ = _project(
+        given.means, None, given.quaternions, given.log_scales.exp(), given.logits.sigmoid(),
+        *cameras[:2], *cameras[3:], 0.3, 0.2, 1e10, 0.0, False, "CameraModelType.PINHOLE",
+    )  # fmt: skip
+    assert radii is not None
+    assert means2d is not None
+    assert depths is not None
+    assert conics is not None
+    records, shown = records_of(means2d, conics, *_looks(given, cameras, degree, signed)), (radii > 0).all(-1)
+    if not describes:
+        return Projected(radii, means2d, depths, records, radii.new_empty(0), means2d.new_empty(0))
+    largest, centres = torch.where(shown, radii.amax(-1), 0), torch.where(shown[..., None], means2d - 0.5, 0.0)
+    return Projected(radii, means2d, depths, records, largest, centres)
+
+
+def project_backward(
+    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
+    found: Tensor, others: Tensor,
+) -> Parameters:  # fmt: skip
+    """As `kernels.project_backward`, by autograd."""
+    leaves = Parameters(*(value.detach().clone().requires_grad_() for value in given))
+    shown = (radii > 0).all(-1)
+    with torch.enable_grad():
+        colors, opacities = _looks(leaves, cameras, degree, signed)
+        scales = leaves.log_scales.exp()
+        covariances, _ = _torch_impl._quat_scale_to_covar_preci(leaves.quaternions, scales, compute_preci=False)
+        _, means2d, _, conics, _ = _torch_impl._fully_fused_projection(
+            leaves.means, covariances, *cameras[:2], *cameras[3:], eps2d=0.3, near_plane=0.2
         )
-        colors = torch.where(shown[..., None], values, 0.0)
-        none = means.new_empty(0)
-        if not describes:
-            return colors, radii.new_empty(len(radii), 0), means.new_empty(len(radii), 0, 2), none
-        largest = torch.where(shown, radii.amax(-1), 0)
-        return colors, largest, torch.where(shown[..., None], splats[0] - 0.5, 0.0), none
+        seen = torch.cat([colors, opacities[..., None], means2d, conics], -1)[shown]
+        total = (seen * torch.cat([found, others[..., :1]], -1)[shown]).sum()
+    return Parameters(*torch.autograd.grad(total, leaves))
 
-    @staticmethod
-    def finish_gradients(
-        means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
-        scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        with torch.enable_grad():
-            leaves = means.detach().clone().requires_grad_(), sh.detach().clone().requires_grad_()
-            none = means.new_empty(0)
-            values, *_ = Finishing.visible_colors(
-                leaves[0], centre, leaves[1], degree, signed, radii, False, (none, none, none), False
-            )
-            by_direction, by_sh = torch.autograd.grad((values * by_color).sum(), leaves, allow_unused=True)
-        by_mean += 0.0 if by_direction is None else by_direction
-        by_scale *= scales
-        return by_sh, by_opacity.sum(0) * opacities * (1 - opacities)
+
+def _parts(records: Tensor) -> list[Tensor]:
+    return [records[..., part].contiguous() for part in (slice(2), slice(2, 5), slice(8, 11), 5)]
+
+
+def blend_forward(
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `blend_kernels.blend_forward`; what it keeps for the backward pass is another thing."""
+    images, alphas, _ = _blend(*_parts(records), None, None, *size, 16, offsets, flat)
+    return images + (1 - alphas) * background[:, None, None], alphas, background
+
+
+def blend_backward(
+    records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, alphas: Tensor, background: Tensor,
+    by_images: Tensor, absolute: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """As `blend_kernels.blend_backward`; absolute gradients are those of sums."""
+    size = images.shape[2], images.shape[1]
+    rest = None, *size, 16, offsets, flat, alphas, torch.empty(0), by_images, torch.zeros_like(alphas), absolute
+    whole, means2d, conics, colors, opacities = _blend_back(*_parts(records), background, *rest)
+    found = torch.cat([colors, opacities[..., None], means2d, conics[..., :2]], -1)
+    return found, torch.cat([conics[..., 2:], *([] if whole is None else [whole])], -1)
+
+
+KERNEL_MODULES = {
+    "kernels": {"project": project, "project_backward": project_backward},
+    "blend_kernels": {"blend_forward": blend_forward, "blend_backward": blend_backward},
+}
+"""Functions by the modules of Triton kernels that they replace."""
 
 
 @contextmanager
-def direct_on_cpu(finishing: Any = Finishing) -> Iterator[None]:
-    """Let `gsplat.direct` find these kernels, and `finishing` in place of `gsplat.kernels`."""
+def direct_on_cpu(**others: Callable[..., Any]) -> Iterator[None]:
+    """Let `gsplat.direct` find these kernels, and these functions in place of our kernels, or others by their names."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bindings, "compiled_functions", Compiled)
         patch.setattr(torch.cuda, "device", lambda device: nullcontext())
-        patch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", finishing)
+        for name, functions in KERNEL_MODULES.items():
+            chosen = {key: others.get(key, function) for key, function in functions.items()}
+            patch.setitem(sys.modules, f"lapgs_plugin.rasterizers.gsplat.{name}", SimpleNamespace(**chosen))
         yield
 
 

@@ -16,9 +16,9 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.bench_scene import make_scene
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.rasterizers.gsplat import blend_gradients, direct
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import Blended, Gradients, ToBlend
+from lapgs_plugin.rasterizers.gsplat import bindings, direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, Parameters
 from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
@@ -42,10 +42,22 @@ class BlendTime:
 
 
 class Kernels(NamedTuple):
-    """Blend with `forward`, and return the gradients with `backward`."""
+    """Blend with `forward`, whose first result is images (c, h, w, 3), and return gradients with `backward`.
 
-    forward: Callable[[], Blended]
-    backward: Callable[[Blended, Tensor], Gradients]
+    It takes all results of `forward`, and a gradient by the images.
+    """
+
+    forward: Callable[[], Sequence[Tensor]]
+    backward: Callable[[Sequence[Tensor], Tensor], Sequence[Tensor]]
+
+
+class Sorted(NamedTuple):
+    """Hold Gaussians of some views as `blend_kernels.blend_forward` takes them."""
+
+    records: Tensor
+    background: Tensor
+    offsets: Tensor
+    flat: Tensor
 
 
 def parse_shapes(text: str | None) -> dict[str, Shape]:
@@ -54,7 +66,7 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
     Raises:
         UserInputError: an entry is not one or two powers of 2, or has too many rows or Gaussians, or too few rows.
     """
-    from lapgs_plugin.rasterizers.gsplat import bindings, blend_kernels
+    from lapgs_plugin.rasterizers.gsplat import blend_kernels
 
     if text is None:
         text = "x".join(map(str, blend_kernels.SHAPE))
@@ -94,41 +106,40 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
 
 
 @torch.no_grad()
-def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> ToBlend:
+def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     """Project a field on a GPU for some views, and sort it into tiles."""
     field = field.to("cuda")
     on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device="cuda")
-    found = direct.forward(
-        field.means.contiguous(), field.quaternions.contiguous(), field.log_scales.contiguous(),
-        field.opacity_logits.contiguous(), field.sh.contiguous(), on_device, background, field.sh_degree, field.signed,
-        describes=False, ours=False,
-    )  # fmt: skip
-    return found.given
+    parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
+    given = Parameters(*(value.contiguous() for value in parameters))
+    seen, tiles, _ = direct.forward(given, on_device, background, field.sh_degree, field.signed, describes=False)
+    return Sorted(seen.records, background, *tiles)
 
 
-def contenders(given: ToBlend, size: tuple[int, int], shapes: Mapping[str, Shape]) -> dict[str, Kernels]:
-    """Return gsplat's kernels, and ours in several shapes."""
+def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
+    """Return gsplat's, which take the numbers of a Gaussian one by one."""
+    compiled, none = bindings.compiled_functions(), given.records.new_zeros(len(given.background), size[1], size[0], 1)
+    color = slice(COLOR_IN_RECORD, COLOR_IN_RECORD + 3)
+    parts = [given.records[..., part].contiguous() for part in (slice(2), slice(2, 5), color, 5)]
+    taken = *parts, given.background, None, *size, bindings.TILE, given.offsets, given.flat
+
+    def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
+        found: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(*taken, *blended[1:], by_images, none, False)
+        return found[1:]
+
+    return Kernels(partial(compiled.rasterize_to_pixels_3dgs_fwd, *taken), backward)
+
+
+def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
+    """Return ours, in one shape."""
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
 
-    # In training, the kernel that computes colours writes them.
-    records = blend_gradients.records_of(given.means2d, given.conics, given.colors, given.opacities)
+    def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
+        images, counts, words = blended
+        rest = given.offsets, given.flat, images, counts, words, by_images
+        return blend_backward(given.records, *rest, False, shape)
 
-    def ours(shape: Shape) -> Kernels:
-        def forward() -> Blended:
-            images, *rest = blend_forward(records, given.background, given.offsets, given.flat, size, shape)
-            return Blended(images, images.new_empty(0), *rest)
-
-        def backward(blended: Blended, by_images: Tensor) -> Gradients:
-            rest = given.offsets, given.flat, blended.images, blended.last, blended.words, by_images
-            return blend_backward(records, *rest, False, shape)
-
-        return Kernels(forward, backward)
-
-    gsplat = Kernels(
-        partial(blend_gradients.blend, given, size),
-        partial(blend_gradients.gradients, given, absolute=False),
-    )
-    return {"gsplat": gsplat, **{name: ours(shape) for name, shape in shapes.items()}}
+    return Kernels(partial(blend_forward, *given, size, shape), backward)
 
 
 def run_case(
@@ -138,11 +149,16 @@ def run_case(
     given, (width, height) = sorted_gaussians(field, cameras), (cameras[0].width, cameras[0].height)
     generator = torch.Generator().manual_seed(0)
     by_images = torch.randn(len(cameras), height, width, 3, generator=generator).cuda()
-    kernels = contenders(given, (width, height), shapes)
+    kernels = {"gsplat": gsplats_kernels(given, (width, height))}
+    kernels |= {name: our_kernels(given, (width, height), shape) for name, shape in shapes.items()}
     results = {}
     for name, one in kernels.items():
         made = one.forward()
-        results[name] = made, (made.images, *one.backward(made, by_images)[1:])
+        by = one.backward(made, by_images)
+        if name != "gsplat":  # in rows of several numbers
+            first, rest = by
+            by = first[..., 4:6], torch.cat([first[..., 6:], rest[..., :1]], -1), first[..., :3], first[..., 3]
+        results[name] = made, (made[0], *by)
     forward: dict[str, list[float]] = {name: [] for name in kernels}
     backward: dict[str, list[float]] = {name: [] for name in kernels}
     for _ in range(repeats):

@@ -40,11 +40,8 @@ def warm_up(
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
     if rasterizer.can_batch:
-        # Rasterizers may take other kernels for as many pixels as launches of training have, and for images alone.
-        cases = [(side, describes) for side in ((16, 512) if on_gpu else (16,)) for describes in (True, False)]
-        for side, describes in cases:
-            views = [camera.resized(side, side)] * 2
-            images = rasterizer.render_batch(model.field, views, background=black, describes=describes).image
+        for describes in (True, False):  # rasterizers may take other kernels for images alone
+            images = rasterizer.render_batch(model.field, [camera] * 2, background=black, describes=describes).image
             none = torch.zeros(images.shape, dtype=target_types[0], device=device)
             photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
             model.step(0.0, 1, scale=StepScale.of(2))

@@ -14,10 +14,8 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.rasterizers.gsplat import blend_gradients
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import GSPLAT, SWITCH, TRITON, triton_works
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.backend import training_rasterizer
@@ -51,8 +49,6 @@ def moved(by: float) -> Camera:
 
 def test_it_is_used() -> None:
     assert direct_works()
-    assert stacking_works()
-    assert triton_works()
 
 
 def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
@@ -60,14 +56,9 @@ def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
         assert direct_works.passes_on(torch.device("cuda"))
 
 
-@pytest.mark.parametrize("gradients", [GSPLAT, TRITON])
 @pytest.mark.parametrize("own_radii", [False, True])
 @pytest.mark.parametrize(("degree", "active", "signed"), [(3, 3, False), (3, 1, True), (0, 0, False), (2, 2, True)])
-def test_images_gradients_and_what_densification_sees(
-    degree: int, active: int, signed: bool, own_radii: bool, gradients: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(SWITCH, gradients)
-    monkeypatch.setattr(blend_gradients, "FEWEST_PIXELS", 0)
+def test_images_gradients_and_what_densification_sees(degree: int, active: int, signed: bool, own_radii: bool) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
     found = []
@@ -129,14 +120,9 @@ def test_nothing_is_kept_of_renders_that_nobody_differentiates() -> None:
         gc.enable()
 
 
-@pytest.mark.parametrize("gradients", [GSPLAT, TRITON])
 @pytest.mark.parametrize("views", [2, 5, 8])
 @pytest.mark.parametrize(("degree", "active", "signed"), [(3, 3, False), (3, 1, True), (0, 0, False)])
-def test_several_views_are_those_of_single_calls(
-    views: int, degree: int, active: int, signed: bool, gradients: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(SWITCH, gradients)
-    monkeypatch.setattr(blend_gradients, "FEWEST_PIXELS", 0)
+def test_several_views_are_those_of_single_calls(views: int, degree: int, active: int, signed: bool) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(views, 3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
     cameras = [moved(0.1 * index) for index in range(views)]

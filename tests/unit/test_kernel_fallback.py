@@ -24,16 +24,12 @@ from lapgs_plugin.ops.position_noise import add_noise
 from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.ops.self_check import SelfCheck
 from lapgs_plugin.ops.upsample import upsample_add
-from lapgs_plugin.rasterizers.gsplat import bindings
-from lapgs_plugin.rasterizers.gsplat import rasterizer as rasterizer_module
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import LearningRates
-from tests.gsplat_on_cpu import Compiled, Finishing, direct_on_cpu, gsplat_on_cpu
+from tests.gsplat_on_cpu import KERNEL_MODULES, direct_on_cpu, gsplat_on_cpu
 
 Pair = tuple[Tensor, Tensor]
-AROUND_GSPLAT = ("activate", "visible_colors", "finish_gradients")
 
 
 class CompilationError(Exception):
@@ -145,41 +141,16 @@ def test_adam(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
     assert line == "Adam in a launch for each tensor: module 'triton.language' has no attribute 'join'"
 
 
-def test_blending(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(bindings, "compiled_functions", Compiled)
-    name = "lapgs_plugin.rasterizers.gsplat.blend_kernels"
-    monkeypatch.setitem(sys.modules, name, broken("blend_forward", "blend_backward"))
-    assert not our_kernels_blend(torch.zeros(1, 3), 1_000_000)
-    (line,) = said(caplog)
-    assert line == "blending by gsplat's kernels, which take longer: module 'triton.language' has no attribute 'join'"
-
-
-@pytest.mark.parametrize("name", AROUND_GSPLAT)
-def test_one_of_the_kernels_around_gsplats(name: str, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("name", [name for functions in KERNEL_MODULES.values() for name in functions])
+def test_a_kernel_of_rendering(name: str, caplog: pytest.LogCaptureFixture) -> None:
     camera, black = Camera(20, 16, 20.0, 20.0, 10.0, 8.0, torch.eye(4)), torch.zeros(3)
-    kernels = broken(name)
-    vars(kernels).update((other, getattr(Finishing, other)) for other in AROUND_GSPLAT if other != name)
     with gsplat_on_cpu():
         expected = GsplatRasterizer(device="cpu", direct=False).render_image(field(), camera, background=black)
-        with direct_on_cpu(kernels):
+        with direct_on_cpu(**{name: raises}):
             rasterizer = GsplatRasterizer(device="cpu")
             rasterizer._may_be_direct = True
             found = rasterizer.render_image(field(), camera, background=black)
+            assert not rasterizer._calls_kernels(field())
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    (line,) = said(caplog)
-    assert line.startswith(
-        "rendering by `gsplat.rasterization`, which takes more launches: module 'triton.language' has"
-    )
-
-
-def test_a_stack(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setitem(sys.modules, "lapgs_plugin.rasterizers.gsplat.kernels", broken("write_to_stack"))
-    chosen: dict[str, bool] = {}
-    monkeypatch.setattr(rasterizer_module, "direct_works", lambda: True)
-    monkeypatch.setattr(rasterizer_module, "GsplatStack", lambda fields, device, **options: chosen.update(options))
-    rasterizer = GsplatRasterizer(device="cpu")
-    rasterizer._may_be_direct = True
-    rasterizer.stack([field()])
-    assert chosen == {"antialiased": False, "direct": False}
-    (line,) = said(caplog)
-    assert line.startswith("rendering the fields of a view together with gsplat's functions")
+    line = said(caplog)[0]
+    assert line.startswith("rendering by `gsplat.rasterization`, which takes longer: module 'triton.language' has")

@@ -23,9 +23,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
+from lapgs_plugin.ops.launch import launch
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
+from lapgs_plugin.rasterizers.gsplat.records import GRADIENT, RECORD
 
 WARP = 32
 COLUMNS = 4
@@ -39,9 +39,6 @@ OPAQUEST = tl.constexpr(0.999)
 LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
 INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
-
-GRADIENT = 8
-"""Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b."""
 
 # Kernels are not compiled anew for other sizes.
 NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
@@ -67,7 +64,6 @@ class Shape(NamedTuple):
 SHAPE = Shape()
 REACH_WARPS = 4
 """Of a program of the launch before; each thread tests a pair at once."""
-SPLIT_BLOCK = 256
 FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
 """At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
 
@@ -484,19 +480,6 @@ def _backward_kernel(
         )  # fmt: skip
 
 
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
-def _split_kernel(
-    gradients: tl.tensor, others: tl.tensor, by_means2d: tl.tensor, by_conics: tl.tensor, n: int,
-    each: tl.constexpr, block: tl.constexpr,
-) -> None:  # fmt: skip
-    row = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
-    here = row < n
-    for i in tl.static_range(2):
-        tl.store(by_means2d + 2 * row + i, tl.load(gradients + 8 * row + 4 + i, here), here)
-        tl.store(by_conics + 3 * row + i, tl.load(gradients + 8 * row + 6 + i, here), here)
-    tl.store(by_conics + 3 * row + 2, tl.load(others + each * row, here), here)
-
-
 def blend_forward(
     records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -518,17 +501,19 @@ def blend_forward(
     width, height = size
     programs, numbers = _launch_of(offsets, flat, size, shape)
     words = flat.new_empty((len(flat) // WARP + offsets.numel()) * shape.regions)
-    _reach_kernel[(offsets.numel(),)](
+    launch(
+        _reach_kernel, (offsets.numel(),),
         records, offsets, flat, words, *numbers[2:],
         columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
-        num_warps=REACH_WARPS, **FUSED,
+        num_warps=REACH_WARPS,
     )  # fmt: skip
     images = records.new_empty(len(offsets), height, width, 3)
     counts = flat.new_empty(programs)
-    _forward_kernel[(programs,)](
+    launch(
+        _forward_kernel, (programs,),
         records, background, offsets, flat, words, images, counts, flat.new_empty(programs, QUEUE.value),
         *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        num_warps=1, maxnreg=FORWARD_REGISTERS, **FUSED,
+        num_warps=1, maxnreg=FORWARD_REGISTERS,
     )  # fmt: skip
     return images, counts, words
 
@@ -536,8 +521,8 @@ def blend_forward(
 def blend_backward(
     records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, counts: Tensor, words: Tensor,
     by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Return the gradients of blending by centres, conics, colours and opacities; arguments are contiguous.
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return the gradients of blending by what it read of each Gaussian; arguments are contiguous.
 
     Args:
         records: (c, n, RECORD).
@@ -548,29 +533,23 @@ def blend_backward(
         shape: of a program's work.
 
     Returns:
-        Sums of absolute values (c, n, 2), meaningless without `absolute`; gradients by centres (c, n, 2) and conics
-        (c, n, 3), contiguous, and by colours (c, n, 3) and opacities (c, n), which are views with `GRADIENT` numbers
-        for each Gaussian.
+        Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and (c, n, 1) by c, or (c, n, 3) with
+        the absolute sums of those by x and y.
     """
     programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), shape)
     assert len(counts) == programs
     count, each = records.numel() // RECORD, 3 if absolute else 1
     zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
-    _backward_kernel[(programs,)](
+    launch(
+        _backward_kernel, (programs,),
         records, offsets, flat, words, counts, images, by_images, found, others,
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS, **FUSED,
+        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS,
     )  # fmt: skip
     leading = records.shape[:-1]
-    by_means2d, by_conics = records.new_empty(*leading, 2), records.new_empty(*leading, 3)
-    _split_kernel[(triton.cdiv(count, SPLIT_BLOCK),)](
-        found, others, by_means2d, by_conics, count, each=each, block=SPLIT_BLOCK, **FUSED
-    )
-    found = found.view(*leading, GRADIENT)
-    by_absolute = others.view(*leading, 3)[..., 1:] if absolute else by_means2d
-    return by_absolute, by_means2d, by_conics, found[..., :3], found[..., 3]
+    return found.view(*leading, GRADIENT), others.view(*leading, each)
 
 
 def _launch_of(offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape) -> tuple[int, tuple[int, ...]]:

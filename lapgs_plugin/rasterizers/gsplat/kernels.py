@@ -1,24 +1,33 @@
-"""Compute activations, colours and their gradients around gsplat's kernels, in Triton.
+"""Project Gaussians and evaluate their colours for several cameras at once, and the gradients of both, in Triton.
 
-As PyTorch operations they would be dozens of launches per render, and for small images launching takes longer than
-computing.
+A thread has a Gaussian and goes from camera to camera: parameters are read, and the gradients by them summed, once for
+all cameras. The formulas and limits of projection are gsplat's (`projection_ewa_3dgs_fused`); where it limits the
+Jacobian, so do we.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import COLOR_IN_RECORD, RECORD
+from lapgs_plugin.ops.launch import blocks, launch
+from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, _load_four
+from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
+from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 BLOCK = 128
-"""Gaussians in a block. Each takes 4 threads, of which 3 have a channel: Triton's sizes are powers of 2."""
+"""Gaussians of a program."""
+NEAR, BLUR = tl.constexpr(NEAR_DEPTH), tl.constexpr(PIXEL_VARIANCE)
+REACH = tl.constexpr(3.33)
+"""Standard deviations at which every footprint ends, as gsplat has it; fainter Gaussians end where alpha is 1/255."""
+BEYOND = tl.constexpr(0.3)
+"""The Jacobian is that of a point this share of half the image beyond its border at most."""
 
 # Kernels are only compiled anew for another number of coefficients: the active degree grows during a stage, and bases
 # and residuals alternate.
@@ -150,6 +159,341 @@ def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, wanted: tl.tensor) -> None:
+    """Store four numbers from a multiple of 16 bytes on where wanted; where compiled, in one instruction."""
+    if INTERPRETED:
+        tl.store(start, a, wanted)
+        tl.store(start + 1, b, wanted)
+        tl.store(start + 2, c, wanted)
+        tl.store(start + 3, d, wanted)
+    else:
+        tl.inline_asm_elementwise(
+            "{ .reg .pred p; setp.ne.b32 p, $6, 0; @p st.global.v4.f32 [$1], {$2, $3, $4, $5}; mov.b32 $0, 0; }",
+            "=r,l,f,f,f,f,r", [start.to(tl.int64), a, b, c, d, wanted.to(tl.int32)], tl.int32, False, 1,
+        )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _unit_quaternions(quaternions: tl.tensor, row: tl.tensor) -> tl.tensor:
+    """Return w, x, y, z of unit length, and one over the length they had."""
+    w, x, y, z = _load_four(quaternions + 4 * row)
+    inverse = 1.0 / tl.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _rotation(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:
+    """Return the rotation matrix of a unit quaternion, row by row."""
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _scales(log_scales: tl.tensor, row: tl.tensor) -> tl.tensor:
+    start = log_scales + 3 * row
+    return tl.exp(tl.load(start)), tl.exp(tl.load(start + 1)), tl.exp(tl.load(start + 2))
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _covariance(
+    a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, e: tl.tensor, f: tl.tensor,
+    g: tl.tensor, h: tl.tensor, i: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return xx, xy, xz, yy, yz and zz of a matrix, given row by row, times its transpose."""
+    return (
+        a * a + b * b + c * c, a * d + b * e + c * f, a * g + b * h + c * i,
+        d * d + e * e + f * f, d * g + e * h + f * i, g * g + h * h + i * i,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _seen_from(
+    poses: tl.tensor, intrinsics: tl.tensor, camera: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor,
+    width: int, height: int,
+) -> tl.tensor:  # fmt: skip
+    """Return a mean in a camera's image plane, and the Jacobian's numbers there.
+
+    They are x / z and y / z; the same where the Jacobian is taken; one over z; z; and the Jacobian's entries by x and z
+    of x, and by y and z of y.
+    """
+    pose, matrix = poses + 16 * camera, intrinsics + 9 * camera
+    right = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2) * z + tl.load(pose + 3)
+    down = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6) * z + tl.load(pose + 7)
+    ahead = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10) * z + tl.load(pose + 11)
+    inverse = 1.0 / tl.where(ahead >= NEAR, ahead, 1.0)
+    u, v = right * inverse, down * inverse
+    fx, cx, fy, cy = tl.load(matrix), tl.load(matrix + 2), tl.load(matrix + 4), tl.load(matrix + 5)
+    past, under = BEYOND * 0.5 * width / fx, BEYOND * 0.5 * height / fy
+    limited_u = tl.minimum((width - cx) / fx + past, tl.maximum(-(cx / fx + past), u))
+    limited_v = tl.minimum((height - cy) / fy + under, tl.maximum(-(cy / fy + under), v))
+    return (
+        u, v, limited_u, limited_v, inverse, ahead,
+        fx * inverse, -fx * limited_u * inverse, fy * inverse, -fy * limited_v * inverse,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _rows_of_projection(
+    poses: tl.tensor, camera: tl.tensor, by_x: tl.tensor, x_by_z: tl.tensor, by_y: tl.tensor, y_by_z: tl.tensor
+) -> tl.tensor:
+    """Return the rows of the Jacobian times the camera's rotation: the gradients of a pixel's x and y by a mean."""
+    pose = poses + 16 * camera
+    r8, r9, r10 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
+    return (
+        by_x * tl.load(pose) + x_by_z * r8, by_x * tl.load(pose + 1) + x_by_z * r9,
+        by_x * tl.load(pose + 2) + x_by_z * r10,
+        by_y * tl.load(pose + 4) + y_by_z * r8, by_y * tl.load(pose + 5) + y_by_z * r9,
+        by_y * tl.load(pose + 6) + y_by_z * r10,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _times(
+    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
+    x: tl.tensor, y: tl.tensor, z: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return a symmetric matrix times a vector."""
+    return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _color(
+    sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int, coefficients: tl.constexpr
+) -> tl.tensor:
+    """Return red, green and blue of rows seen in unit directions, by the first `active` coefficients."""
+    start = sh + row * (3 * coefficients)
+    red, green, blue = 0.0 * x, 0.0 * x, 0.0 * x
+    if coefficients % 4 == 0:  # then rows begin at multiples of 16 bytes
+        for k in tl.static_range(0, coefficients, 4):
+            if k < active:  # coefficients that are not in use are 0 or wait for their degree
+                r0, g0, b0, r1 = _load_four(start + 3 * k)
+                g1, b1, r2, g2 = _load_four(start + 3 * k + 4)
+                b2, r3, g3, b3 = _load_four(start + 3 * k + 8)
+                f0, f1 = _used_basis(k, x, y, z, active), _used_basis(k + 1, x, y, z, active)
+                f2, f3 = _used_basis(k + 2, x, y, z, active), _used_basis(k + 3, x, y, z, active)
+                red += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
+                green += f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
+                blue += f0 * b0 + f1 * b1 + f2 * b2 + f3 * b3
+    else:
+        for k in tl.static_range(coefficients):
+            factor = _used_basis(k, x, y, z, active)
+            red += factor * tl.load(start + 3 * k)
+            green += factor * tl.load(start + 3 * k + 1)
+            blue += factor * tl.load(start + 3 * k + 2)
+    return red, green, blue
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _used_basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int) -> tl.tensor:
+    """Return the k-th spherical harmonic, 0 if it is not active."""
+    used = tl.full((1,), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
+    return tl.where(used, _basis(k, x, y, z), 0.0)
+
+
+@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _project_kernel(
+    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor, sh: tl.tensor,
+    poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor,
+    radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, records: tl.tensor,
+    visible_radii: tl.tensor, visible_pixels: tl.tensor,
+    width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
+    coefficients: tl.constexpr, describes: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
+) -> None:  # fmt: skip
+    rows = tl.program_id(0) * block + tl.arange(0, block)
+    here, row = rows < n, tl.minimum(rows, n - 1)
+    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
+    w, x, y, z, _ = _unit_quaternions(quaternions, row)
+    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
+    s0, s1, s2 = _scales(log_scales, row)
+    xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
+    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
+    reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
+    camera, placed = first, start + rows
+    while camera < first + cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
+        u, v, _, _, _, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height
+        )
+        matrix = intrinsics + 9 * camera
+        pixel_x = tl.load(matrix) * u + tl.load(matrix + 2)
+        pixel_y = tl.load(matrix + 4) * v + tl.load(matrix + 5)
+        px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, by_x, x_by_z, by_y, y_by_z)
+        cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
+        wide = px * cov_x + py * cov_y + pz * cov_z + BLUR
+        skew = qx * cov_x + qy * cov_y + qz * cov_z
+        cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
+        high = qx * cov_x + qy * cov_y + qz * cov_z + BLUR
+        area = wide * high - skew * skew
+        across, down = tl.ceil(reach * tl.sqrt(wide)), tl.ceil(reach * tl.sqrt(high))
+        visible = here & (depth >= NEAR) & (area > 0.0) & (opacity >= FAINTEST) & (across > 0.0) & (down > 0.0)
+        visible = visible & (pixel_x + across > 0.0) & (pixel_x - across < width)
+        visible = visible & (pixel_y + down > 0.0) & (pixel_y - down < height)
+
+        away_x, away_y = mean_x - tl.load(centres + 3 * camera), mean_y - tl.load(centres + 3 * camera + 1)
+        away_z = mean_z - tl.load(centres + 3 * camera + 2)
+        near = 1.0 / tl.sqrt(tl.where(visible, away_x * away_x + away_y * away_y + away_z * away_z, 1.0))
+        colored = tl.where(visible, row, 0)  # so that memory of others is not read
+        red, green, blue = _color(sh, colored, away_x * near, away_y * near, away_z * near, active, coefficients)
+        if signed == 0:
+            red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
+
+        across, down = tl.where(visible, across, 0.0).to(tl.int32), tl.where(visible, down, 0.0).to(tl.int32)
+        tl.store(radii + 2 * placed, across, here)
+        tl.store(radii + 2 * placed + 1, down, here)
+        tl.store(pixels + 2 * placed, pixel_x, visible)
+        tl.store(pixels + 2 * placed + 1, pixel_y, visible)
+        tl.store(depths + placed, depth, visible)
+        inverse = 1.0 / area
+        into = records + placed * record
+        _store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
+        _store_four(into + 4, wide * inverse, opacity, opacity, opacity, visible)
+        _store_four(into + 8, red, green, blue, blue, visible)
+        if describes:
+            tl.store(visible_radii + placed, tl.maximum(across, down), here)
+            tl.store(visible_pixels + 2 * placed, tl.where(visible, pixel_x - 0.5, 0.0), here)
+            tl.store(visible_pixels + 2 * placed + 1, tl.where(visible, pixel_y - 0.5, 0.0), here)
+        camera += 1
+        placed += n
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _of_covariance(
+    wide: tl.tensor, skew: tl.tensor, high: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, visible: tl.tensor
+) -> tl.tensor:
+    """Return gradients by xx, by xy and yx each, and by yy of a covariance from those by its inverse (a, b, c).
+
+    They are minus the inverse, times the gradient by the inverse, times the inverse; 0 where nothing is visible.
+    """
+    half = 0.5 * skew
+    t00, t01, t10, t11 = a * wide + b * half, a * half + b * high, b * wide + c * half, b * half + c * high
+    return (
+        tl.where(visible, -(t00 * a + t01 * b), 0.0), tl.where(visible, -(t00 * b + t01 * c), 0.0),
+        tl.where(visible, -(t10 * b + t11 * c), 0.0),
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _of_place(
+    pose: tl.tensor, u: tl.tensor, v: tl.tensor, limited_u: tl.tensor, limited_v: tl.tensor, inverse: tl.tensor,
+    x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor,
+    fx: tl.tensor, fy: tl.tensor, fz: tl.tensor, gx: tl.tensor, gy: tl.tensor, gz: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return the gradient by a mean from those by its pixel, x and y, and by the projection's rows, halved, f and g.
+
+    The others are results of `_seen_from`.
+    """
+    r0, r1, r2 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
+    r4, r5, r6 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
+    r8, r9, r10 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
+    of_x_by_x, of_y_by_y = 2.0 * (fx * r0 + fy * r1 + fz * r2), 2.0 * (gx * r4 + gy * r5 + gz * r6)
+    of_x_by_z, of_y_by_z = 2.0 * (fx * r8 + fy * r9 + fz * r10), 2.0 * (gx * r8 + gy * r9 + gz * r10)
+    # The Jacobian's entries are f / z and -f u / z; where u is limited, it does not depend on the mean.
+    free_u, free_v = limited_u == u, limited_v == v
+    right = x_by_x * (of_x - tl.where(free_u, of_x_by_z * inverse, 0.0))
+    down = y_by_y * (of_y - tl.where(free_v, of_y_by_z * inverse, 0.0))
+    ahead = -x_by_x * (u * of_x + inverse * (of_x_by_x - tl.where(free_u, 2.0, 1.0) * limited_u * of_x_by_z))
+    ahead -= y_by_y * (v * of_y + inverse * (of_y_by_y - tl.where(free_v, 2.0, 1.0) * limited_v * of_y_by_z))
+    return (
+        r0 * right + r4 * down + r8 * ahead,
+        r1 * right + r5 * down + r9 * ahead,
+        r2 * right + r6 * down + r10 * ahead,
+    )
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _store_shape_gradients(
+    by_quaternion: tl.tensor, by_log_scale: tl.tensor, rows: tl.tensor, here: tl.tensor,
+    w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, length: tl.tensor,
+    s0: tl.tensor, s1: tl.tensor, s2: tl.tensor,
+    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
+) -> None:  # fmt: skip
+    """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances."""
+    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
+    # By the columns of the rotation, without their factor of twice the square of the scale.
+    ux, uy, uz = _times(xx, xy, xz, yy, yz, zz, a, d, g)
+    vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, b, e, h)
+    wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
+    s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
+    tl.store(by_log_scale + 3 * rows, s0 * (ux * a + uy * d + uz * g), here)
+    tl.store(by_log_scale + 3 * rows + 1, s1 * (vx * b + vy * e + vz * h), here)
+    tl.store(by_log_scale + 3 * rows + 2, s2 * (wx * c + wy * f + wz * i), here)
+    ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
+    of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
+    of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
+    of_y = 2.0 * (x * (vx + uy) - 2.0 * y * (ux + wz) + z * (wy + vz) + w * (wx - uz))
+    of_z = 2.0 * (x * (wx + uz) + y * (wy + vz) - 2.0 * z * (ux + vy) + w * (uy - vx))
+    along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
+    of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
+    _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
+
+
+@triton.jit(do_not_specialize=("width", "height", "n", "cameras"))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _shape_gradient_kernel(
+    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
+    poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor, others: tl.tensor,
+    by_mean: tl.tensor, by_quaternion: tl.tensor, by_log_scale: tl.tensor, by_logit: tl.tensor,
+    width: int, height: int, n: int, cameras: int,
+    record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
+) -> None:  # fmt: skip
+    rows = tl.program_id(0) * block + tl.arange(0, block)
+    here, row = rows < n, tl.minimum(rows, n - 1)
+    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
+    w, x, y, z, length = _unit_quaternions(quaternions, row)
+    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
+    s0, s1, s2 = _scales(log_scales, row)
+    xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
+    none = 0.0 * mean_x
+    by_x, by_y, by_z, by_opacity = none, none, none, none
+    by_xx, by_xy, by_xz, by_yy, by_yz, by_zz = none, none, none, none, none, none
+    camera = 0
+    while camera < cameras:
+        placed = camera * n + row
+        visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
+        placed = tl.where(visible, placed, 0)  # so that memory of others is not read
+        _, _, _, of_opacity = _load_four(found + placed * gradient)
+        of_x, of_y, of_wide, of_skew = _load_four(found + placed * gradient + 4)
+        of_high = tl.load(others + placed * each)
+        _, _, conic_a, conic_b = _load_four(records + placed * record)
+        conic_c = tl.load(records + placed * record + 4)
+        by_opacity += tl.where(visible, of_opacity, 0.0)
+        of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
+        wide, skew, high = _of_covariance(of_wide, of_skew, of_high, conic_a, conic_b, conic_c, visible)
+        u, v, limited_u, limited_v, inverse, _, x_by_x, x_by_z, y_by_y, y_by_z = _seen_from(
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height
+        )
+        px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, x_by_x, x_by_z, y_by_y, y_by_z)
+        # By the rows of the projection, halved; and by the covariance in the world.
+        fx, fy, fz = wide * px + skew * qx, wide * py + skew * qy, wide * pz + skew * qz
+        gx, gy, gz = skew * px + high * qx, skew * py + high * qy, skew * pz + high * qz
+        by_xx += fx * px + gx * qx
+        by_xy += fx * py + gx * qy
+        by_xz += fx * pz + gx * qz
+        by_yy += fy * py + gy * qy
+        by_yz += fy * pz + gy * qz
+        by_zz += fz * pz + gz * qz
+        fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
+        gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
+        right, down, ahead = _of_place(
+            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, fx, fy, fz, gx, gy, gz
+        )
+        by_x += right
+        by_y += down
+        by_z += ahead
+        camera += 1
+    tl.store(by_mean + 3 * rows, by_x, here)
+    tl.store(by_mean + 3 * rows + 1, by_y, here)
+    tl.store(by_mean + 3 * rows + 2, by_z, here)
+    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
+    tl.store(by_logit + rows, by_opacity * opacity * (1.0 - opacity), here)
+    _store_shape_gradients(
+        by_quaternion, by_log_scale, rows, here, w, x, y, z, length, s0, s1, s2,
+        by_xx, by_xy, by_xz, by_yy, by_yz, by_zz,
+    )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _view_directions(mean: tl.tensor, centre: tl.tensor, channel: tl.tensor, there: tl.tensor) -> tl.tensor:
     """Return unit directions x, y, z (g, 1) from the camera's centre, and one over the distances.
 
@@ -163,100 +507,6 @@ def _view_directions(mean: tl.tensor, centre: tl.tensor, channel: tl.tensor, the
     y = tl.sum(tl.where(channel == 1, away, 0.0), 1)[:, None] * inverse
     z = tl.sum(tl.where(channel == 2, away, 0.0), 1)[:, None] * inverse
     return x, y, z, inverse
-
-
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _block_colors(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, rows: tl.tensor, channel: tl.tensor, visible: tl.tensor,
-    active: int, signed: int, coefficients: tl.constexpr, block: tl.constexpr,
-) -> tl.tensor:  # fmt: skip
-    """Return colours (g, 4) of a block; the last channel is meaningless."""
-    mean = tl.load(means + 3 * rows + channel, visible & (channel < 3), 0.0)
-    x, y, z, _ = _view_directions(mean, centre, channel, visible)
-    color = tl.zeros((block, 4), tl.float32)
-    for k in tl.static_range(coefficients):
-        used = tl.full((1, 4), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
-        wanted = visible & (channel < 3) & used
-        color += _basis(k, x, y, z) * tl.load(sh + (rows * coefficients + k) * 3 + channel, wanted, 0.0)
-    return tl.where(signed != 0, color, tl.maximum(color + 0.5, 0.0))
-
-
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _write_record(
-    records: tl.tensor, placed: tl.tensor, pixels: tl.tensor, conics: tl.tensor, rows: tl.tensor,
-    opacity: tl.tensor, color: tl.tensor, channel: tl.tensor, visible: tl.tensor, record: tl.constexpr,
-) -> None:  # fmt: skip
-    """Write to the rows `placed` what blending reads of visible Gaussians, see `blend_gradients.RECORD`."""
-    conic = tl.load(conics + 3 * rows + channel - 2, visible & (channel >= 2), 0.0)
-    first = tl.load(pixels + 2 * rows + channel, visible & (channel < 2), 0.0) + conic
-    last = tl.load(conics + 3 * rows + 2, visible, 0.0)
-    start = records + placed * record + channel
-    tl.store(start, first, visible)
-    tl.store(start + 4, tl.where(channel == 0, last, opacity), visible & (channel < 2))
-    tl.store(start + 8, color, visible & (channel < 3))
-
-
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
-def _activate_kernel(
-    log_scales: tl.tensor, logits: tl.tensor, scales: tl.tensor, opacities: tl.tensor, n: int, block: tl.constexpr
-) -> None:
-    rows = tl.program_id(0) * block + tl.arange(0, block)  # (g,)
-    logit = tl.load(logits + rows, rows < n, 0.0)
-    tl.store(opacities + rows, 1.0 / (1.0 + tl.exp(-logit)), rows < n)
-    for third in tl.static_range(3):
-        places = (tl.program_id(0) * 3 + third) * block + tl.arange(0, block)
-        tl.store(scales + places, tl.exp(tl.load(log_scales + places, places < 3 * n, 0.0)), places < 3 * n)
-
-
-@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
-def _color_kernel(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor,
-    pixels: tl.tensor, conics: tl.tensor, opacities: tl.tensor,
-    colors: tl.tensor, visible_radii: tl.tensor, visible_pixels: tl.tensor,
-    n: int, cameras: int, active: int, signed: int,
-    coefficients: tl.constexpr, describes: tl.constexpr, packs: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
-) -> None:  # fmt: skip
-    # Cameras of one block are consecutive, so that its coefficients are still in the cache.
-    camera = tl.program_id(0) % cameras
-    rows = tl.program_id(0) // cameras * block + tl.arange(0, block)[:, None]  # (g, 1)
-    channel = tl.arange(0, 4)[None, :]
-    here = rows < n
-    seen = rows + camera.to(tl.int64) * n  # in tensors with a row for every camera
-    across, down = tl.load(radii + 2 * seen, here, 0), tl.load(radii + 2 * seen + 1, here, 0)
-    visible = (across > 0) & (down > 0)
-    color = _block_colors(means, centre + 3 * camera, sh, rows, channel, visible, active, signed, coefficients, block)
-    if packs:
-        opacity = tl.load(opacities + rows, visible, 0.0)
-        _write_record(colors, seen, pixels, conics, seen, opacity, color, channel, visible, record)
-    else:
-        tl.store(colors + seen * 3 + channel, color, here & (channel < 3))
-    if describes:
-        tl.store(visible_radii + seen, tl.where(visible, tl.maximum(across, down), 0), here)
-        for side in tl.static_range(2):
-            centred = tl.load(pixels + 2 * seen + side, visible, 0.5) - 0.5
-            tl.store(visible_pixels + 2 * seen + side, centred, here)
-
-
-@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
-def _stack_kernel(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor,
-    opacities: tl.tensor, radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, conics: tl.tensor,
-    all_radii: tl.tensor, all_pixels: tl.tensor, all_depths: tl.tensor, records: tl.tensor,
-    n: int, active: int, signed: int, start: int,
-    coefficients: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
-) -> None:  # fmt: skip
-    rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
-    channel = tl.arange(0, 4)[None, :]
-    here, pair = rows < n, (rows < n) & (channel < 2)
-    placed = rows + start
-    across, down = tl.load(radii + 2 * rows, here, 0), tl.load(radii + 2 * rows + 1, here, 0)
-    visible = (across > 0) & (down > 0)
-    color = _block_colors(means, centre, sh, rows, channel, visible, active, signed, coefficients, block)
-    opacity = tl.load(opacities + rows, visible, 0.0)
-    _write_record(records, placed, pixels, conics, rows, opacity, color, channel, visible, record)
-    tl.store(all_radii + 2 * placed + channel, tl.load(radii + 2 * rows + channel, pair, 0), pair)
-    tl.store(all_pixels + 2 * placed + channel, tl.load(pixels + 2 * rows + channel, pair, 0.0), pair)
-    tl.store(all_depths + placed, tl.load(depths + rows, here, 0.0), here)
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -279,13 +529,11 @@ def _all_of_basis(
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
-def _gradient_kernel(
-    means: tl.tensor, centre: tl.tensor, sh: tl.tensor, radii: tl.tensor, colors: tl.tensor,
-    scales: tl.tensor, opacities: tl.tensor,
-    by_color: tl.tensor, by_mean: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
-    by_sh: tl.tensor, by_logit: tl.tensor,
+def _color_gradient_kernel(
+    means: tl.tensor, centres: tl.tensor, sh: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor,
+    by_mean: tl.tensor, by_sh: tl.tensor,
     n: tl.tensor, cameras: int, active: int, signed: int,
-    of_color: tl.constexpr, of_by_color: tl.constexpr, of_by_opacity: tl.constexpr,
+    record: tl.constexpr, color_in_record: tl.constexpr, gradient: tl.constexpr,
     coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers.
@@ -301,16 +549,16 @@ def _gradient_kernel(
         wanted = in_channel & (tl.full((1, 4), i, tl.int32) < active)
         one = tl.load(sh + (rows * coefficients + i) * 3 + channel, wanted, 0.0)
         coefficient = tl.where(k == i, one[None], coefficient)
-    of_opacity = tl.zeros((block, 1), tl.float32)
-    of_x, of_y, of_z = tl.zeros_like(of_opacity), tl.zeros_like(of_opacity), tl.zeros_like(of_opacity)
+    of_x = tl.zeros((block, 1), tl.float32)
+    of_y, of_z = tl.zeros_like(of_x), tl.zeros_like(of_x)
     mean = tl.load(means + 3 * rows + channel, in_channel, 0.0)
     camera = 0
-    while camera < cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
-        seen = rows + camera * n.to(tl.int64)  # in tensors with a row for every camera
+    while camera < cameras:
+        seen = camera * n + rows  # in tensors with a row for every camera
         visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
-        x, y, z, inverse = _view_directions(mean, centre + 3 * camera, channel, here & visible)
-        flow = tl.load(by_color + of_by_color * seen + channel, in_channel & visible, 0.0)  # (g, 4)
-        color = tl.load(colors + of_color * seen + channel, in_channel & visible, 0.0)
+        x, y, z, inverse = _view_directions(mean, centres + 3 * camera, channel, here & visible)
+        flow = tl.load(found + seen * gradient + channel, in_channel & visible, 0.0)  # (g, 4)
+        color = tl.load(records + seen * record + color_in_record + channel, in_channel & visible, 0.0)
         flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
         sums += _all_of_basis(0, k, x, y, z, coefficients) * flow[None]
         if coefficients > 1:
@@ -322,138 +570,85 @@ def _gradient_kernel(
             of_x += (in_x - radial * x) * inverse
             of_y += (in_y - radial * y) * inverse
             of_z += (in_z - radial * z) * inverse
-        of_opacity += tl.load(by_opacity + of_by_opacity * seen, here, 0.0)
         camera += 1
     tl.store(by_sh + in_sh, tl.where(k < active, sums, 0.0), given)
     tl.debug_barrier()  # all threads have read what is written now
-    there = 3 * rows + channel
     if coefficients > 1:
+        there = 3 * rows + channel
         moved = tl.where(channel == 0, of_x, tl.where(channel == 1, of_y, of_z))
         tl.store(by_mean + there, tl.load(by_mean + there, in_channel) + moved, in_channel)
-    tl.store(by_scale + there, tl.load(by_scale + there, in_channel) * tl.load(scales + there, in_channel), in_channel)
-    opacity = tl.load(opacities + rows, here, 0.0)
-    tl.store(by_logit + rows, of_opacity * opacity * (1.0 - opacity), here)
 
 
-def activate(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tensor]:
-    """Return exp (n, 3) and sigmoid (n,) in one kernel; all tensors of this module are contiguous float32."""
-    scales, opacities = torch.empty_like(log_scales), torch.empty_like(opacity_logits)
-    _launch(_activate_kernel, len(scales), (log_scales, opacity_logits, scales, opacities))
-    return scales, opacities
-
-
-def visible_colors(
-    means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, describes: bool,
-    splats: tuple[Tensor, Tensor, Tensor], packs: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Return the colours of Gaussians that are visible to c cameras, and their radii and centres.
+def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
+    """Project at least one Gaussian, and evaluate its colour.
 
     Args:
-        means: (n, 3).
-        centre: (c, 3) of the cameras.
-        sh: (n, k, 3).
-        degree: highest to evaluate.
+        degree: highest of SH to evaluate.
         signed: whether colours are the raw SH values.
-        radii: (c, n, 2) gsplat's, int32; 0 where culled.
-        describes: whether radii and centres are needed.
-        splats: gsplat's centres (c, n, 2) and conics (c, n, 3), and opacities (n,).
-        packs: write records.
-
-    Returns:
-        (c, n, 3) colours, 0 where culled; (c, n) radii and (c, n, 2) centres as in `RenderResult`, both empty unless
-        described; records (c, n, RECORD). If there are records, colours are a view of them and
-        neither means anything where culled; otherwise they are empty.
+        describes: fill in visible radii and centres.
     """
-    cameras, n = radii.shape[:2]
-    written = means.new_empty(cameras, n, RECORD if packs else 3)
-    visible_radii = radii.new_empty(cameras, n if describes else 0)
-    visible_pixels = means.new_empty(cameras, n if describes else 0, 2)
-    _launch(
-        _color_kernel,
-        n,
-        (means, centre, sh, radii, *splats, written, visible_radii, visible_pixels),
-        (cameras, (degree + 1) ** 2, int(signed)),
-        programs=cameras,
-        coefficients=sh.shape[1],
-        describes=describes,
-        packs=packs,
-        record=RECORD,
-    )
-    if not packs:
-        return written, visible_radii, visible_pixels, means.new_empty(0)
-    return written[..., COLOR_IN_RECORD : COLOR_IN_RECORD + 3], visible_radii, visible_pixels, written
+    count, n, like = len(cameras.poses), len(given.means), given.means
+    integers = like.new_empty(count, n, 2, dtype=torch.int32)
+    described = n if describes else 0
+    made = Projected(
+        integers, like.new_empty(count, n, 2), like.new_empty(count, n), like.new_empty(count, n, RECORD),
+        integers.new_empty(count, described), like.new_empty(count, described, 2),
+    )  # fmt: skip
+    _project(given, cameras, (0, count), degree, signed, made, 0, describes)
+    return made
 
 
-def write_to_stack(
-    means: Tensor,
-    centre: Tensor,
-    sh: Tensor,
-    opacities: Tensor,
-    signed: bool,
-    projected: Sequence[Tensor],
-    stacked: Sequence[Tensor],
-    start: int,
+def project_into(
+    stacked: Sequence[Tensor], start: int, given: Parameters, cameras: DeviceCameras, camera: int, signed: bool
 ) -> None:
-    """Write one field's projection and records to the tensors of a stack of fields.
+    """Write the projection of one field, seen by one of some cameras, to the tensors of a stack of fields.
 
     Args:
-        means, sh, signed: as `visible_colors` takes them; all coefficients are evaluated.
-        opacities: (n,).
-        centre: (3,) of the camera.
-        projected: gsplat's radii (n, 2), centres (n, 2), depths (n,) and conics (n, 3).
-        stacked: radii, centres and depths of all fields, and records (m, RECORD); written from
-            row `start` on, records where visible.
+        stacked: radii (m, 2), centres (m, 2), depths (m,) and records (m, RECORD) of all fields.
+        start: first row of this one.
+        camera: number of its camera; its size is that of all.
+        given, cameras, signed: as `project` takes them; all coefficients are evaluated.
     """
-    _launch(
-        _stack_kernel,
-        len(means),
-        (means, centre, sh, opacities, *projected, *stacked),
-        (sh.shape[1], int(signed), start),
-        coefficients=sh.shape[1],
-        record=RECORD,
-    )
+    made = Projected(*stacked, *stacked[:2])
+    _project(given, cameras, (camera, 1), math.isqrt(given.sh.shape[1]) - 1, signed, made, start, describes=False)
 
 
-def finish_gradients(
-    means: Tensor, centre: Tensor, sh: Tensor, degree: int, signed: bool, radii: Tensor, colors: Tensor,
-    scales: Tensor, opacities: Tensor, by_color: Tensor, by_mean: Tensor, by_scale: Tensor, by_opacity: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return the gradients by SH (n, k, 3) and by opacities' logits (n,), and complete the others in place.
+def _project(
+    given: Parameters, cameras: DeviceCameras, chosen: tuple[int, int], degree: int, signed: bool, into: Projected,
+    start: int, describes: bool,
+) -> None:  # fmt: skip
+    n = len(given.means)
+    launch(
+        _project_kernel, (blocks(n, BLOCK),),
+        *given, *cameras[:3], *into, cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start,
+        coefficients=given.sh.shape[1], describes=describes, record=RECORD, block=BLOCK,
+    )  # fmt: skip
+
+
+def project_backward(
+    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
+    found: Tensor, others: Tensor,
+) -> Parameters:  # fmt: skip
+    """Return the gradients by parameters, summed over cameras.
 
     Args:
-        means, centre, sh, degree, signed, radii: arguments of `visible_colors`.
-        colors: its result.
-        scales, opacities: results of `activate`.
-        by_color: (c, n, 3) gradients of each camera; this and the next may be views with other numbers between rows.
-        by_opacity: (c, n) of each camera.
-        by_mean: (n, 3) gradient summed over cameras; the part through the view direction is added.
-        by_scale: (n, 3) gradient summed over cameras; becomes that by logarithms.
+        given, cameras, degree, signed: arguments of `project`.
+        radii, records: its results.
+        found, others: gradients (c, n, GRADIENT) and (c, n, 1 or more) as `blend_backward` returns them.
     """
-    by_sh, by_logit, coefficients = torch.empty_like(sh), torch.empty_like(opacities), sh.shape[1]
-    given = colors, scales, opacities, by_color, by_mean, by_scale, by_opacity
-    _launch(
-        _gradient_kernel,
-        len(means),
-        (means, centre, sh, radii, *given, by_sh, by_logit),
-        (len(radii), (degree + 1) ** 2, int(signed)),
-        block=BLOCK // 4,  # one channel of a Gaussian for each thread
-        of_color=colors.stride(1),
-        of_by_color=by_color.stride(1),
-        of_by_opacity=by_opacity.stride(1),
-        coefficients=coefficients,
-        padded=triton.next_power_of_2(coefficients),
-    )
-    return by_sh, by_logit
-
-
-def _launch(
-    kernel: Any,
-    n: int,
-    given: tuple[Tensor, ...],
-    numbers: tuple[int, ...] = (),
-    programs: int = 1,
-    block: int = BLOCK,
-    **constants: int,
-) -> None:
-    """Start a kernel with `programs` programs for each block of Gaussians."""
-    kernel[(triton.cdiv(n, block) * programs,)](*given, n, *numbers, block=block, **constants, **FUSED)
+    by = Parameters(*(torch.empty_like(value) for value in given))
+    n, count, coefficients = len(given.means), len(cameras.poses), given.sh.shape[1]
+    launch(
+        _shape_gradient_kernel, (blocks(n, BLOCK),),
+        *given[:4], *cameras[:2], radii, records, found, others, *by[:4], cameras.width, cameras.height, n, count,
+        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK,
+    )  # fmt: skip
+    block = BLOCK // 4  # one channel of a Gaussian for each thread
+    launch(
+        _color_gradient_kernel, (blocks(n, block),),
+        given.means, cameras.centres, given.sh, radii, records, found, by.means, by.sh,
+        n, count, (degree + 1) ** 2, int(signed),
+        record=RECORD, color_in_record=COLOR_IN_RECORD, gradient=GRADIENT,
+        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=block,
+    )  # fmt: skip
+    return by

@@ -28,9 +28,10 @@ from lapgs_plugin.fields.rasterizer import (
     require_color,
 )
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD, our_kernels_blend
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.self_check import direct_works, stacking_works
+from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
+from lapgs_plugin.rasterizers.gsplat.records import RECORD
+from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
 
@@ -80,8 +81,8 @@ class GsplatRasterizer(Rasterizer):
         absgrad: offer `RenderResult.absgrad2d`, which makes the backward pass a little slower.
         own_radii: return gsplat's radii, which bound where alpha reaches 1/255, instead of computing those of three
             sigma; training only asks which are above 0.
-        direct: call gsplat's kernels directly (`gsplat.direct`), which takes half of the launches. None does so if it
-            is validated on this machine. Not available with `packed` or `antialiasing`.
+        direct: render by our own kernels (`gsplat.direct`), in a fraction of the time. None does so if they are
+            validated on this machine. Not available with `packed` or `antialiasing`.
 
     Raises:
         MissingExtraError: gsplat cannot render on this machine.
@@ -174,9 +175,9 @@ class GsplatRasterizer(Rasterizer):
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
-        nothing = torch.empty(0, device=self._device)
-        direct = self._calls_kernels(*fields) and stacking_works() and our_kernels_blend(nothing)
-        return GsplatStack(fields, self._device, antialiased=self._stock.antialiased, direct=direct)
+        if self._calls_kernels(*fields):
+            return DirectStack(fields, self._device)
+        return GsplatStack(fields, self._device, antialiased=self._stock.antialiased)
 
     def _calls_kernels(self, *fields: GaussianField, cameras: int = 1) -> bool:
         """Return whether kernels are called directly, for fields or cameras that are rendered together."""

@@ -23,9 +23,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
-from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.bindings import TILE
-from lapgs_plugin.rasterizers.gsplat.blend_gradients import RECORD
 from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
@@ -37,15 +35,11 @@ class GsplatStack(FieldStack):
         fields: float32, on any device. Later changes to them have no effect.
         device: that renders.
         antialiased: dim Gaussians that are smaller than a pixel.
-        direct: call gsplat's kernels directly, see `GsplatRasterizer`; not with `antialiased`.
     """
 
-    def __init__(
-        self, fields: Sequence[GaussianField], device: torch.device, *, antialiased: bool = False, direct: bool = False
-    ) -> None:
+    def __init__(self, fields: Sequence[GaussianField], device: torch.device, *, antialiased: bool = False) -> None:
         self._antialiased = antialiased
         self._signed = [field.signed for field in fields]
-        self._unsigned = torch.tensor([[not signed] for signed in self._signed], device=device).float()  # (f, 1)
         self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field, and the end
         self._means = _joined([field.means for field in fields], device)  # (n, 3)
         self._quaternions = _joined([field.quaternions for field in fields], device)  # (n, 4)
@@ -54,9 +48,6 @@ class GsplatStack(FieldStack):
         self._sh = _joined([field.sh for field in fields], device)  # (n, k, 3)
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
-        self._direct = direct
-        parts = self._means, self._quaternions, self._scales, self._opacities, self._sh
-        self._parts = [[part[self._rows(i)] for part in parts] for i in range(len(fields))]
         if device.type == "cuda":
             torch.cuda.synchronize(device)  # once: from now on every stream may use it
 
@@ -64,51 +55,21 @@ class GsplatStack(FieldStack):
     def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
         height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
         viewmats, intrinsics, positions = cameras_on_device(cameras, self._means)
-        alphas: Tensor | None = None  # where the background is blended in already
         if self._starts[len(cameras)] == 0:
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
-        elif self._direct:
-            with torch.cuda.device(self._means.device):  # Triton launches on the current device
-                images = self._render_directly(cameras, viewmats, intrinsics, positions[0], background, (width, height))
         else:
             projected = self._project(cameras, viewmats, intrinsics)
             images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
         rendered = []
         for i, camera in enumerate(cameras):
             image = images[i, : camera.height, : camera.width]  # (h, w, 3)
-            if alphas is not None and background is not None and not self._signed[i]:
+            if background is not None and not self._signed[i]:
                 image = torch.addcmul(image, 1 - alphas[i, : camera.height, : camera.width], background)
             rendered.append(image.permute(2, 0, 1))
         return rendered
 
     def _rows(self, index: int) -> slice:
         return slice(self._starts[index], self._starts[index + 1])
-
-    def _render_directly(
-        self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor, position: Tensor,
-        background: Tensor | None, size: tuple[int, int],
-    ) -> Tensor:  # fmt: skip
-        """Return images (f, h, w, 3) of the first fields in two launches for each and three for all."""
-        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
-        from lapgs_plugin.rasterizers.gsplat.kernels import write_to_stack
-
-        count, like = self._starts[len(cameras)], self._means
-        radii = torch.empty(count, 2, dtype=torch.int32, device=like.device)
-        means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
-        for i, camera in enumerate(cameras):
-            means, quaternions, scales, opacities, sh = self._parts[i]
-            if len(means) == 0:
-                continue  # gsplat divides by their number
-            pose, matrix, own_size = viewmats[i : i + 1], intrinsics[i : i + 1], camera.size
-            projected = bindings.project(means, quaternions, scales, opacities, pose, matrix, own_size)
-            stacked = radii, means2d, depths, records
-            write_to_stack(means, position, sh, opacities, self._signed[i], projected, stacked, self._starts[i])
-        of_image = self._images[:count]
-        offsets, flat = bindings.sort_into_tiles([radii, means2d, depths], size, len(cameras), of_image)
-        behind = bindings.zeros(torch.Size((len(cameras), 3)), like.device)
-        if background is not None:
-            behind = self._unsigned[: len(cameras)] * background
-        return blend_forward(records, behind, offsets, flat, size)[0]
 
     def _project(self, cameras: Sequence[Camera], viewmats: Tensor, intrinsics: Tensor) -> list[Tensor]:
         """Return radii (n, 2), centres (n, 2), depths (n,), conics (n, 3) and opacities (n,) of the first fields."""

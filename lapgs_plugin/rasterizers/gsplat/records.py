@@ -1,0 +1,46 @@
+"""How Gaussians lie in memory between our kernels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+RECORD, COLOR_IN_RECORD = 12, 8
+"""Numbers of a Gaussian's record, which lies together in memory, and where its colour begins.
+
+They are x, y, conic (a, b, c), opacity, two without meaning, red, green, blue, and one more without meaning.
+"""
+GRADIENT = 8
+"""Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
+
+
+class Parameters(NamedTuple):
+    """Hold a field's parameters, contiguous float32 on one device."""
+
+    means: Tensor  # (n, 3)
+    quaternions: Tensor  # (n, 4)
+    log_scales: Tensor  # (n, 3)
+    logits: Tensor  # (n,)
+    sh: Tensor  # (n, k, 3)
+
+
+class Projected(NamedTuple):
+    """Hold n Gaussians as c cameras see them. Where culled, radii are 0, and only what is visible has a meaning."""
+
+    radii: Tensor  # (c, n, 2) int32, half sides of a footprint in pixels
+    means2d: Tensor  # (c, n, 2) in pixels
+    depths: Tensor  # (c, n)
+    records: Tensor  # (c, n, RECORD)
+    visible_radii: Tensor  # (c, n) int32 the larger of both, 0 where culled; empty unless described
+    centres: Tensor  # (c, n, 2) as in `RenderResult`; empty unless described
+
+
+def records_of(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> Tensor:
+    """Return the records (c, n, RECORD) of Gaussians, (c, n, 2), (c, n, 3), (c, n, 3) and (c, n).
+
+    Training and frames have them from `kernels.project`.
+    """
+    two = torch.zeros_like(means2d)
+    return torch.cat([means2d, conics, opacities[..., None], two, colors, two[..., :1]], -1)
