@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -41,6 +42,18 @@ FINITE_CHECK_EVERY = 100
 """Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
 LOSSES_READ_EVERY = 50
 """Losses that are read together on a GPU: each reading waits until the GPU has caught up with the processor."""
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """Hold views that are rendered together, at the poses of their scene.
+
+    Attributes:
+        iterations: that train them, in order.
+    """
+
+    iterations: Sequence[int]
+    views: Sequence[LevelView]
 
 
 @dataclass(frozen=True)
@@ -110,6 +123,7 @@ class StageRun:
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
+    _following: tuple[range, list[_Planned]] | None = None  # the next step, planned while this one was run
 
     def __post_init__(self) -> None:
         self._dropout = self.settings.dropout_for(len(self.views))
@@ -206,22 +220,31 @@ class StageRun:
         """Return the iterations of the step after `done` ones."""
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))
 
-    def _launches(self, iterations: range) -> list[list[int]]:
+    def _launches(self, iterations: range) -> list[_Planned]:
         """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
+        views = [self._view(iteration) for iteration in iterations]
         if not self.batches or len(iterations) == 1:
-            return [[iteration] for iteration in iterations]
+            return [_Planned([iteration], [view]) for iteration, view in zip(iterations, views, strict=True)]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
-        for iteration in iterations:
-            camera, degree = self._view(iteration).camera, self.schedule.active_sh_degree(iteration)
-            key = (self.coarser.is_joint(iteration), camera.width, camera.height, degree)
-            alike.setdefault(key, []).append(iteration)
+        for place, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
+            degree = self.schedule.active_sh_degree(iteration)
+            key = (self.coarser.is_joint(iteration), view.camera.width, view.camera.height, degree)
+            alike.setdefault(key, []).append(place)
         launches = []
         for (_, width, height, _), group in alike.items():
             most = max(1, round(PIXELS_OF_A_LAUNCH / (width * height)))
             count = math.ceil(len(group) / min(most, self.progress.most_views or most))
             size = math.ceil(len(group) / count)
-            launches += [group[start : start + size] for start in range(0, len(group), size)]
+            for start in range(0, len(group), size):
+                places = group[start : start + size]
+                launches.append(_Planned([iterations[i] for i in places], [views[i] for i in places]))
         return launches
+
+    def _planned(self, iterations: range) -> list[_Planned]:
+        """Return the launches of a step, which the step before may have planned to prefetch the images."""
+        if self._following is None or self._following[0] != iterations:
+            self._following = iterations, self._launches(iterations)
+        return self._following[1]
 
     def _step(self, iterations: range) -> None:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
@@ -255,13 +278,14 @@ class StageRun:
     def _run_launches(self, iterations: range) -> list[_Launch]:
         """Run all launches of a step. If the GPU's memory is too small, start the step again with smaller launches."""
         while True:
-            planned = self._launches(iterations)
-            following = self._launches(self._next(iterations[-1]))[:1] if iterations[-1] < self.stage.iterations else []
+            planned = self._planned(iterations)
+            is_last = iterations[-1] == self.stage.iterations
+            following = [] if is_last else self._planned(self._next(iterations[-1]))[:1]
             try:
-                thens = [*planned[1:], *following, []]
+                thens = [*planned[1:], *following, None]
                 done = [self._launch(each, then) for each, then in zip(planned, thens, strict=False)]
             except torch.cuda.OutOfMemoryError:
-                most = max(map(len, planned))
+                most = max(len(each.views) for each in planned)
                 if most == 1:
                     raise
             else:
@@ -271,6 +295,7 @@ class StageRun:
             # Outside of `except`, because the error keeps the tensors of the render alive.
             self._forget_gradients()
             self.progress.most_views = most // 2
+            self._following = None
             self.say(
                 f"level {self.stage.level}: no memory for {most} views at once; from here on {most // 2} are rendered "
                 "together, and steps take as many as before"
@@ -289,14 +314,15 @@ class StageRun:
         """What is learned of the training views, by its name in checkpoints."""
         return {"exposure": self.exposures, "poses": self.poses}
 
-    def _launch(self, iterations: Sequence[int], then: Sequence[int]) -> _Launch:
-        """Render some views of a step and propagate their losses back; `then` are the iterations to prefetch."""
-        last = iterations[-1]
+    def _launch(self, planned: _Planned, then: _Planned | None) -> _Launch:
+        """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""
+        iterations, last = planned.iterations, planned.iterations[-1]
         self.coarser.start_if_joint(last)
-        views = [self._view(iteration) for iteration in iterations]
+        views = [at_pose(view, self.poses) for view in planned.views]
         names, cameras = [view.name for view in views], [view.camera for view in views]
         loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names, cameras)
-        self._prefetch(then)
+        if then is not None:
+            self._prefetch(then)
         self.breakdown.mark("forward")
         gaussians = self.model.field
         shown = thinned(gaussians, self._dropout * self.schedule.progress_at(last))
@@ -312,7 +338,7 @@ class StageRun:
             self._note_loss(kept.item(), last, len(views))
         self.breakdown.mark("backward")
         # The gradient of the sum of the views' losses; for one view, the default of `backward`.
-        loss.backward(torch.full_like(kept, len(views)))  # type: ignore[no-untyped-call]  # torch's
+        loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
@@ -341,15 +367,13 @@ class StageRun:
         return image, None
 
     def _view(self, iteration: int) -> LevelView:
-        index = view_index(iteration, len(self.views), self.settings.seed, self.stage.level)
-        return at_pose(self.views[index], self.poses)
+        return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
 
-    def _prefetch(self, iterations: Sequence[int]) -> None:
+    def _prefetch(self, planned: _Planned) -> None:
         """Copy the images of the next launch to the device while this one renders."""
-        for iteration in iterations[:AHEAD]:
-            name = self._view(iteration).name
-            self.images.prefetch(name)
-            self.coarser.prefetch(name)
+        for view in planned.views[:AHEAD]:
+            self.images.prefetch(view.name)
+            self.coarser.prefetch(view.name)
 
     def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
         threshold = self.densifier.score_threshold(iteration)
@@ -420,3 +444,10 @@ class StageRun:
             if (found := state.get(name)) is not None:
                 assert learned is not None, "the trainer looks for it"
                 learned.restore(found)
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # the cache serves calls that need gradients
+def _number(value: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a number as a cached tensor, which must not be written to."""
+    return torch.full((), value, dtype=dtype, device=device)

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 
+NUMBERS_OF_16_BYTES = 4
+
 
 class DeviceCameras(NamedTuple):
     """Hold c cameras of one image size on the device that renders."""
@@ -22,33 +24,45 @@ class DeviceCameras(NamedTuple):
     height: int
 
 
+class _Copied(NamedTuple):
+    """Hold a camera on the device, also as flat tensors, which are quicker to concatenate."""
+
+    camera: weakref.ref[Camera]
+    alone: DeviceCameras
+    pose: Tensor  # (16,)
+    intrinsics: Tensor  # (9,)
+    centre: Tensor  # (3,)
+
+
 class CameraCache:
     """Copy each camera to the device once, because training views come back many times."""
 
     def __init__(self) -> None:
-        self._copied: dict[int, tuple[weakref.ref[Camera], DeviceCameras]] = {}
+        self._copied: dict[int, _Copied] = {}
 
     def get(self, cameras: Sequence[Camera], like: Tensor) -> DeviceCameras:
         """Return cameras of one size on the device of `like`; several are concatenated in one launch."""
         if len(cameras) == 1:
-            return self._one(cameras[0], like)
-        copied, count = [self._one(camera, like) for camera in cameras], len(cameras)
-        # Centres first: Triton compiles anew for tensors that do not begin at a multiple of 16 bytes.
-        parts = [getattr(each, kind).view(-1) for kind in ("centres", "poses", "intrinsics") for each in copied]
-        numbers = torch.cat(parts)
-        centres, poses, intrinsics = numbers[: 3 * count], numbers[3 * count : 19 * count], numbers[19 * count :]
-        return DeviceCameras(
-            poses.view(-1, 4, 4), intrinsics.view(-1, 3, 3), centres.view(-1, 3), copied[0].width, copied[0].height
-        )
+            return self._one(cameras[0], like).alone
+        copied = [self._one(camera, like) for camera in cameras]
+        _, (first, *_), poses, intrinsics, centres = zip(*copied, strict=True)
+        count = len(cameras)
+        # Filled up, because Triton compiles anew for tensors that do not begin at a multiple of 16 bytes.
+        filling = -count % NUMBERS_OF_16_BYTES
+        numbers = torch.cat((*poses, *intrinsics, copied[0].pose[:filling], *centres))
+        pose, matrix, _, centre = numbers.split_with_sizes((16 * count, 9 * count, filling, 3 * count))
+        return DeviceCameras(pose.view(-1, 4, 4), matrix.view(-1, 3, 3), centre.view(-1, 3), first.width, first.height)
 
-    def _one(self, camera: Camera, like: Tensor) -> DeviceCameras:
-        known, copied = self._copied.get(id(camera), (None, None))
-        if known is None or copied is None or known() is not camera or copied.poses.device != like.device:
+    def _one(self, camera: Camera, like: Tensor) -> _Copied:
+        copied = self._copied.get(id(camera))
+        if copied is None or copied.camera() is not camera or copied.pose.device != like.device:
             with torch.inference_mode(False):  # cached for later calls, which may need gradients
                 poses, intrinsics, centres = (value.contiguous() for value in cameras_on_device([camera], like))
-            copied = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
+                flat = poses.view(-1), intrinsics.view(-1), centres.view(-1)
             key, cache = id(camera), self._copied
-            cache[key] = (weakref.ref(camera, lambda _: cache.pop(key, None)), copied)
+            known = weakref.ref(camera, lambda _: cache.pop(key, None))
+            alone = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
+            copied = cache[key] = _Copied(known, alone, *flat)
         return copied
 
 
@@ -56,17 +70,19 @@ def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, 
     """Return poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU."""
     poses = [camera.world_to_camera for camera in cameras]
     elsewhere = any(pose.device.type != "cpu" for pose in poses)
-    # All numbers in one tensor: each small copy costs time in every frame.
+    # All numbers in one tensor: each small copy costs time in every frame. Each part of a single camera's begins at a
+    # multiple of 16 bytes.
     rows = [[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0] for c in cameras]
     if not elsewhere:
-        rows = [[*row, *_pose_numbers(pose)] for row, pose in zip(rows, poses, strict=True)]
+        nothing = [0.0] * (12 - 9)
+        rows = [[*row, *nothing, *_pose_numbers(pose)] for row, pose in zip(rows, poses, strict=True)]
     # Page-locked, because a copy from other memory would wait for the GPU.
     numbers = torch.tensor(rows, dtype=like.dtype, pin_memory=like.device.type == "cuda")
-    numbers = numbers.to(like.device, non_blocking=True)  # (b, 28) or (b, 9)
+    numbers = numbers.to(like.device, non_blocking=True)  # (b, 31) or (b, 9)
     intrinsics = numbers[:, :9].reshape(-1, 3, 3)
     if elsewhere:
         return torch.stack(poses).to(like), intrinsics, torch.stack([camera.position for camera in cameras]).to(like)
-    return numbers[:, 9:25].reshape(-1, 4, 4), intrinsics, numbers[:, 25:]
+    return numbers[:, 12:28].reshape(-1, 4, 4), intrinsics, numbers[:, 28:]
 
 
 def _pose_numbers(pose: Tensor) -> list[float]:
