@@ -494,38 +494,74 @@ def _shape_gradient_kernel(
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _view_directions(mean: tl.tensor, centre: tl.tensor, channel: tl.tensor, there: tl.tensor) -> tl.tensor:
-    """Return unit directions x, y, z (g, 1) from the camera's centre, and one over the distances.
-
-    Means are (g, 4), the last channel without meaning. Every load is of neighbouring channels, because Triton would
-    spread Gaussians alone over threads in another way, and each harmonic would go from one thread to another.
-    """
-    away = mean - tl.load(centre + channel, channel < 3, 0.0)
-    away = tl.where(there & (channel < 3), away, 1.0)
-    inverse = 1.0 / tl.sqrt(tl.sum(tl.where(channel < 3, away * away, 0.0), 1))[:, None]
-    x = tl.sum(tl.where(channel == 0, away, 0.0), 1)[:, None] * inverse
-    y = tl.sum(tl.where(channel == 1, away, 0.0), 1)[:, None] * inverse
-    z = tl.sum(tl.where(channel == 2, away, 0.0), 1)[:, None] * inverse
-    return x, y, z, inverse
+def _slopes(
+    k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
+    red: tl.tensor, green: tl.tensor, blue: tl.tensor, of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return what the k-th spherical harmonic adds to the gradient by x, y and z of the direction."""
+    weight = red * of_red + green * of_green + blue * of_blue
+    weight = tl.where(tl.full((1,), k, tl.int32) < active, weight, 0.0)
+    return _basis_x(k, x, y, z) * weight, _basis_y(k, x, y, z) * weight, _basis_z(k, x, y, z) * weight
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _all_of_basis(
-    derivative: tl.constexpr, k: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, coefficients: tl.constexpr
-) -> tl.tensor:
-    """Return all spherical harmonics (k, g, 1), or with `derivative` 1 to 3 their derivatives by x, y or z."""
-    # k is the same in all threads, so that the compiler decides the comparisons.
-    found = tl.zeros_like(k + x[None])
-    for i in tl.static_range(coefficients):
-        if derivative == 0:
-            found = tl.where(k == i, _basis(i, x, y, z)[None], found)
-        if derivative == 1:
-            found = tl.where(k == i, _basis_x(i, x, y, z)[None], found)
-        if derivative == 2:
-            found = tl.where(k == i, _basis_y(i, x, y, z)[None], found)
-        if derivative == 3:
-            found = tl.where(k == i, _basis_z(i, x, y, z)[None], found)
-    return found
+def _by_direction(
+    sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
+    of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor, coefficients: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return the gradient by x, y and z of the directions from that by colours."""
+    start = sh + row * (3 * coefficients)
+    by_x, by_y, by_z = 0.0 * x, 0.0 * x, 0.0 * x
+    if coefficients % 4 == 0:
+        for k in tl.static_range(0, coefficients, 4):
+            if k < active:
+                r0, g0, b0, r1 = _load_four(start + 3 * k)
+                g1, b1, r2, g2 = _load_four(start + 3 * k + 4)
+                b2, r3, g3, b3 = _load_four(start + 3 * k + 8)
+                x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
+                x1, y1, z1 = _slopes(k + 1, x, y, z, active, r1, g1, b1, of_red, of_green, of_blue)
+                x2, y2, z2 = _slopes(k + 2, x, y, z, active, r2, g2, b2, of_red, of_green, of_blue)
+                x3, y3, z3 = _slopes(k + 3, x, y, z, active, r3, g3, b3, of_red, of_green, of_blue)
+                by_x += x0 + x1 + x2 + x3
+                by_y += y0 + y1 + y2 + y3
+                by_z += z0 + z1 + z2 + z3
+    else:
+        for k in tl.static_range(coefficients):
+            r0, g0, b0 = tl.load(start + 3 * k), tl.load(start + 3 * k + 1), tl.load(start + 3 * k + 2)
+            x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
+            by_x += x0
+            by_y += y0
+            by_z += z0
+    return by_x, by_y, by_z
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _one_of(sums: tl.tensor, k: tl.tensor, one: tl.constexpr) -> tl.tensor:
+    """Return a row (g,) of sums (k, g), which a thread has all of."""
+    return tl.sum(tl.where(k == one, sums, 0.0), 0)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _store_sh(
+    by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor, k: tl.tensor, here: tl.tensor,
+    coefficients: tl.constexpr,
+) -> None:  # fmt: skip
+    """Store red, green and blue (k, g) of each coefficient."""
+    if coefficients % 4 == 0:
+        for i in tl.static_range(0, coefficients, 4):
+            into = by_sh + (rows * coefficients + i) * 3
+            r0, g0, b0, r1 = _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), _one_of(red, k, i + 1)
+            g1, b1, r2 = _one_of(green, k, i + 1), _one_of(blue, k, i + 1), _one_of(red, k, i + 2)
+            g2, b2, r3 = _one_of(green, k, i + 2), _one_of(blue, k, i + 2), _one_of(red, k, i + 3)
+            _store_four(into, r0, g0, b0, r1, here)
+            _store_four(into + 4, g1, b1, r2, g2, here)
+            _store_four(into + 8, b2, r3, _one_of(green, k, i + 3), _one_of(blue, k, i + 3), here)
+    else:
+        for i in tl.static_range(coefficients):
+            into = by_sh + (rows * coefficients + i) * 3
+            tl.store(into, _one_of(red, k, i), here)
+            tl.store(into + 1, _one_of(green, k, i), here)
+            tl.store(into + 2, _one_of(blue, k, i), here)
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -536,47 +572,46 @@ def _color_gradient_kernel(
     record: tl.constexpr, color_in_record: tl.constexpr, gradient: tl.constexpr,
     coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    # A thread has one channel of a Gaussian with all coefficients, whose sums over cameras stay in its registers.
-    rows = tl.program_id(0) * block + tl.arange(0, block)[:, None]  # (g, 1)
-    channel = tl.arange(0, 4)[None, :]
-    here, in_channel = rows < n, (rows < n) & (channel < 3)
-    k = tl.arange(0, padded)[:, None, None]
-    in_sh = (rows[None] * coefficients + k) * 3 + channel[None]  # (k, g, 4)
-    given = in_channel[None] & (k < coefficients)
-    sums = tl.zeros((padded, block, 4), tl.float32)
-    coefficient = tl.zeros_like(sums)
-    for i in tl.static_range(coefficients):  # one by one, which keeps them in the thread
-        wanted = in_channel & (tl.full((1, 4), i, tl.int32) < active)
-        one = tl.load(sh + (rows * coefficients + i) * 3 + channel, wanted, 0.0)
-        coefficient = tl.where(k == i, one[None], coefficient)
-    of_x = tl.zeros((block, 1), tl.float32)
-    of_y, of_z = tl.zeros_like(of_x), tl.zeros_like(of_x)
-    mean = tl.load(means + 3 * rows + channel, in_channel, 0.0)
+    rows = tl.program_id(0) * block + tl.arange(0, block)
+    here, row = rows < n, tl.minimum(rows, n - 1)
+    k = tl.arange(0, padded)[:, None]  # of sums, which a thread has in its registers
+    red = tl.zeros((padded, block), tl.float32)
+    green, blue = tl.zeros_like(red), tl.zeros_like(red)
+    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
+    by_x, by_y, by_z = 0.0 * mean_x, 0.0 * mean_x, 0.0 * mean_x
     camera = 0
     while camera < cameras:
-        seen = camera * n + rows  # in tensors with a row for every camera
-        visible = tl.min(tl.load(radii + 2 * seen + channel, here & (channel < 2), 1), 1)[:, None] > 0
-        x, y, z, inverse = _view_directions(mean, centres + 3 * camera, channel, here & visible)
-        flow = tl.load(found + seen * gradient + channel, in_channel & visible, 0.0)  # (g, 4)
-        color = tl.load(records + seen * record + color_in_record + channel, in_channel & visible, 0.0)
-        flow = tl.where((signed != 0) | (color > 0.0), flow, 0.0)
-        sums += _all_of_basis(0, k, x, y, z, coefficients) * flow[None]
+        placed = camera * n + row
+        visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
+        placed = tl.where(visible, placed, 0)  # so that memory of others is not read
+        of_red, of_green, of_blue, _ = _load_four(found + placed * gradient)
+        color_r, color_g, color_b, _ = _load_four(records + placed * record + color_in_record)
+        of_red = tl.where(visible & ((signed != 0) | (color_r > 0.0)), of_red, 0.0)
+        of_green = tl.where(visible & ((signed != 0) | (color_g > 0.0)), of_green, 0.0)
+        of_blue = tl.where(visible & ((signed != 0) | (color_b > 0.0)), of_blue, 0.0)
+        x, y = mean_x - tl.load(centres + 3 * camera), mean_y - tl.load(centres + 3 * camera + 1)
+        z = mean_z - tl.load(centres + 3 * camera + 2)
+        near = 1.0 / tl.sqrt(tl.where(visible, x * x + y * y + z * z, 1.0))
+        x, y, z = x * near, y * near, z * near
+        basis = tl.zeros_like(red)
+        for i in tl.static_range(coefficients):
+            basis = tl.where(k == i, _used_basis(i, x, y, z, active)[None], basis)
+        red += basis * of_red[None]
+        green += basis * of_green[None]
+        blue += basis * of_blue[None]
         if coefficients > 1:
-            weighted = coefficient * flow[None]
-            in_x = tl.sum(tl.sum(_all_of_basis(1, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
-            in_y = tl.sum(tl.sum(_all_of_basis(2, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
-            in_z = tl.sum(tl.sum(_all_of_basis(3, k, x, y, z, coefficients) * weighted, 0), 1)[:, None]
+            source = tl.where(visible, row, 0)
+            in_x, in_y, in_z = _by_direction(sh, source, x, y, z, active, of_red, of_green, of_blue, coefficients)
             radial = in_x * x + in_y * y + in_z * z  # moving along the direction does not change it
-            of_x += (in_x - radial * x) * inverse
-            of_y += (in_y - radial * y) * inverse
-            of_z += (in_z - radial * z) * inverse
+            by_x += (in_x - radial * x) * near
+            by_y += (in_y - radial * y) * near
+            by_z += (in_z - radial * z) * near
         camera += 1
-    tl.store(by_sh + in_sh, tl.where(k < active, sums, 0.0), given)
-    tl.debug_barrier()  # all threads have read what is written now
+    _store_sh(by_sh, rows, red, green, blue, k, here, coefficients)
     if coefficients > 1:
-        there = 3 * rows + channel
-        moved = tl.where(channel == 0, of_x, tl.where(channel == 1, of_y, of_z))
-        tl.store(by_mean + there, tl.load(by_mean + there, in_channel) + moved, in_channel)
+        tl.store(by_mean + 3 * rows, tl.load(by_mean + 3 * row) + by_x, here)
+        tl.store(by_mean + 3 * rows + 1, tl.load(by_mean + 3 * row + 1) + by_y, here)
+        tl.store(by_mean + 3 * rows + 2, tl.load(by_mean + 3 * row + 2) + by_z, here)
 
 
 def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
@@ -643,12 +678,11 @@ def project_backward(
         *given[:4], *cameras[:2], radii, records, found, others, *by[:4], cameras.width, cameras.height, n, count,
         record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK,
     )  # fmt: skip
-    block = BLOCK // 4  # one channel of a Gaussian for each thread
     launch(
-        _color_gradient_kernel, (blocks(n, block),),
+        _color_gradient_kernel, (blocks(n, BLOCK),),
         given.means, cameras.centres, given.sh, radii, records, found, by.means, by.sh,
         n, count, (degree + 1) ** 2, int(signed),
         record=RECORD, color_in_record=COLOR_IN_RECORD, gradient=GRADIENT,
-        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=block,
+        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=BLOCK,
     )  # fmt: skip
     return by
