@@ -30,7 +30,7 @@ from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
-from lapgs_plugin.ops.position_noise.in_torch import add_noise_torch
+from lapgs_plugin.ops.position_noise.in_torch import displacements
 from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch
 
 NUMBA = "Numba"
@@ -257,15 +257,19 @@ def _regularization_versions(ours: str, gaussians: int, device: torch.device) ->
 
 def _noise_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
-    quaternions, log_scales, logits, noise = (
-        torch.randn(gaussians, *columns, generator=generator).to(device) for columns in ((4,), (3,), (), (3,))
+    quaternions, log_scales, logits = (
+        torch.randn(gaussians, *columns, generator=generator).to(device) for columns in ((4,), (3,), ())
     )
 
-    def version(add: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, float], None]) -> Version:
-        means = torch.zeros(gaussians, 3, device=device)
-        return Version(lambda: add(means, quaternions, log_scales, logits, noise, 1e-3), means)
+    def in_torch(means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, amount: float) -> None:
+        means += displacements(quaternions, log_scales, logits, torch.randn_like(means), amount)
 
-    versions = {TORCH: version(add_noise_torch)}
+    def version(add: Callable[[Tensor, Tensor, Tensor, Tensor, float], None]) -> Version:
+        means = torch.zeros(gaussians, 3, device=device)
+        # By nothing, because each version draws noise of its own; it takes as long.
+        return Version(lambda: add(means, quaternions, log_scales, logits, 0.0), means)
+
+    versions = {TORCH: version(in_torch)}
     if ours != NUMBA and position_noise.triton_works():
         versions[ours] = version(position_noise.add_noise)
     return versions

@@ -162,7 +162,7 @@ def shake(model: TrainableField, amount: float) -> None:
     means, quaternions = model.params["means"], model.params["quats"]
     log_scales, logits = model.params["scales"], model.params["opacities"]
     if means.device.type != "cpu":
-        add_noise(means, quaternions, log_scales, logits, torch.randn_like(means), amount)
+        add_noise(means, quaternions, log_scales, logits, amount)
         return
     rows = (torch.sigmoid(logits) < SOLID).nonzero()[:, 0]  # a GPU would wait for their number
     noise = torch.randn(len(rows), 3, dtype=means.dtype)

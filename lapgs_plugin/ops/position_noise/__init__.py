@@ -5,34 +5,41 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.position_noise.in_torch import add_noise_torch
+from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS, displacements
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
-def add_noise(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, noise: Tensor, amount: float
-) -> None:
-    """Move Gaussians by `displacements`, in place; arguments are those of that function, with `means` (n, 3)."""
+def add_noise(means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, amount: float) -> None:
+    """Move Gaussians by `displacements` of noise, which depends on the state of torch's generators, in place.
+
+    Args:
+        means: (n, 3).
+        quaternions, log_scales, opacity_logits, amount: as `displacements` takes them.
+    """
     if len(means) == 0:
         return
     if triton_works(means):
         from lapgs_plugin.ops.position_noise.in_triton import add_noise_triton
 
-        add_noise_triton(means, quaternions, log_scales, opacity_logits, noise, amount)
+        seed = int(torch.randint(2**31 - 1, ()))
+        add_noise_triton(means, quaternions, log_scales, opacity_logits, amount, seed)
     else:
-        add_noise_torch(means, quaternions, log_scales, opacity_logits, noise, amount)
+        means += displacements(quaternions, log_scales, opacity_logits, torch.randn_like(means), amount)
 
 
 @matches_reference("noise of positions in several operations instead of one kernel", 1e-5)
 def triton_works(device: torch.device) -> float:
-    """Compare how far some Gaussians move, relative to the farthest."""
+    """Compare how far some Gaussians move, relative to the farthest, by the noise that moves a round one."""
     from lapgs_plugin.ops.position_noise.in_triton import add_noise_triton
 
     generator = torch.Generator().manual_seed(0)
-    log_scales, noise = (torch.randn(300, 3, generator=generator).to(device) for _ in range(2))
+    log_scales = torch.randn(300, 3, generator=generator).to(device)
     quaternions = torch.randn(300, 4, generator=generator).to(device)
     logits = torch.linspace(-8.0, 8.0, 300, device=device)
-    moved, expected = (torch.zeros_like(noise) for _ in range(2))
-    for add, means in ((add_noise_triton, moved), (add_noise_torch, expected)):
-        add(means, quaternions, log_scales, logits, noise, 0.5)
+    noise, moved = (torch.zeros_like(log_scales) for _ in range(2))
+    round_ones = quaternions, torch.zeros_like(log_scales), torch.full_like(logits, -20.0)
+    add_noise_triton(noise, *round_ones, 1.0, seed=7)
+    noise /= torch.sigmoid(torch.tensor(SHARPNESS * FAINT))
+    add_noise_triton(moved, quaternions, log_scales, logits, 0.5, seed=7)
+    expected = displacements(quaternions, log_scales, logits, noise, 0.5)
     return largest([(moved - expected).abs() / expected.abs().max()])

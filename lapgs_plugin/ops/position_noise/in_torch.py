@@ -26,13 +26,6 @@ def displacements(
     return _turned(quaternions, along * torch.exp(2.0 * log_scales))
 
 
-def add_noise_torch(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, noise: Tensor, amount: float
-) -> None:
-    """Do `add_noise` in PyTorch's operations."""
-    means += displacements(quaternions, log_scales, opacity_logits, noise, amount)
-
-
 def _turned(quaternions: Tensor, vectors: Tensor, *, back: bool = False) -> Tensor:
     """Rotate vectors (n, 3) by quaternions (n, 4), or back; matrices would take three times the memory."""
     real, axis = quaternions[:, :1], quaternions[:, 1:]

@@ -1,4 +1,4 @@
-"""Shake positions in one kernel."""
+"""Draw noise and shake positions by it in one kernel."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def _turned(
     )
 
 
-@triton.jit(do_not_specialize=("amount", "n"))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=("amount", "seed", "n"))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _kernel(
-    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor, noise: tl.tensor,
-    amount: float, n: int, sharpness: tl.constexpr, faint: tl.constexpr, block: tl.constexpr,
+    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
+    amount: float, seed: int, n: int, sharpness: tl.constexpr, faint: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here = rows < n
@@ -37,8 +37,7 @@ def _kernel(
     share = amount / (1.0 + tl.exp(sharpness * (opacity - faint)))
     w, i = tl.load(quaternions + 4 * rows, here, 1.0), tl.load(quaternions + 4 * rows + 1, here, 0.0)
     j, k = tl.load(quaternions + 4 * rows + 2, here, 0.0), tl.load(quaternions + 4 * rows + 3, here, 0.0)
-    x, y = tl.load(noise + 3 * rows, here, 0.0), tl.load(noise + 3 * rows + 1, here, 0.0)
-    z = tl.load(noise + 3 * rows + 2, here, 0.0)
+    x, y, z, _ = tl.randn4x(seed, rows)
     x, y, z = _turned(-w, i, j, k, share * x, share * y, share * z)
     x *= tl.exp(2.0 * tl.load(log_scales + 3 * rows, here, 0.0))
     y *= tl.exp(2.0 * tl.load(log_scales + 3 * rows + 1, here, 0.0))
@@ -50,8 +49,12 @@ def _kernel(
 
 
 def add_noise_triton(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, noise: Tensor, amount: float
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, amount: float, seed: int
 ) -> None:
-    """Do `add_noise` for contiguous float32 tensors on one CUDA device."""
-    n, given = len(means), (means, quaternions, log_scales, opacity_logits, noise)
-    launch(_kernel, (blocks(n, BLOCK),), *given, amount, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)
+    """Do `add_noise` for contiguous float32 tensors on one CUDA device.
+
+    Args:
+        seed: from 0 to 2^31 - 1; the same one draws the same noise.
+    """
+    n, given = len(means), (means, quaternions, log_scales, opacity_logits)
+    launch(_kernel, (blocks(n, BLOCK),), *given, amount, seed, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)
