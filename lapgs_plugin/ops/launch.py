@@ -9,8 +9,6 @@ import torch
 import triton
 from torch import Tensor
 
-from lapgs_plugin.ops.self_check import FUSED
-
 try:
     from triton import knobs
 
@@ -19,6 +17,12 @@ except ImportError:  # before Triton 3.4
     from triton.compiler import CompiledKernel
 
     HOOKS = CompiledKernel
+
+FUSED = {"enable_fp_fusion": True}
+"""Option of every launch of our kernels: a product and a sum are one instruction.
+
+Triton 3.9 warns where it is not said, and announces that later versions will make two, which takes longer.
+"""
 
 # Triton does not promise how a compiled kernel is started. These versions do it in the same way, for NVIDIA's GPUs.
 VERSION = tuple(map(int, triton.__version__.split(".")[:2]))
@@ -32,7 +36,7 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Tensor | float, *
     """Start a kernel on the current device and stream.
 
     Triton looks for the compiled kernel by all that it is compiled for, which takes longer than many kernels run. Here
-    the types of the arguments suffice, as long as tensors begin at multiples of 16 bytes and numbers fit in 32 bits.
+    the types of the arguments suffice, as long as tensors begin at multiples of 16 bytes and integers fit in 32 bits.
     Triton starts all other kernels itself.
 
     Args:
@@ -49,20 +53,23 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Tensor | float, *
         start(programs, arguments)
 
 
-def _start_of(kernel: Any, arguments: tuple[Tensor | float, ...], constants: dict[str, Any]) -> Start | None:
+def _start_of(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
     """Return what starts a kernel for arguments like these; None if Triton has to."""
     if not isinstance(kernel, triton.JITFunction) or _heard(HOOKS.launch_enter_hook) or _heard(HOOKS.launch_exit_hook):
         return None
     places = 0
     kinds: list[Any] = []
     for argument in arguments:
-        if isinstance(argument, Tensor):
+        kind = type(argument)
+        if kind is float:
+            kinds.append(kind)
+        elif kind is int:
+            if not -(2**31) <= argument < 2**31:
+                return None
+            kinds.append(kind)
+        else:
             places |= argument.data_ptr()
             kinds.append(argument.dtype)
-        elif -(2**31) <= argument < 2**31:
-            kinds.append(type(argument))
-        else:
-            return None
     if places % 16 != 0:
         return None
     device = triton.runtime.driver.active.get_current_device()

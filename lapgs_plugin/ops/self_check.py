@@ -12,12 +12,6 @@ logger = logging.getLogger(__name__)
 
 Difference = Callable[[torch.device], float]
 
-FUSED = {"enable_fp_fusion": True}
-"""Option of every launch of our kernels: a product and a sum are one instruction.
-
-Triton 3.9 warns where it is not said, and announces that later versions will make two, which takes longer.
-"""
-
 
 class SelfCheck:
     """Decide whether Triton kernels are used here: they have to compile and to agree with PyTorch's operations.

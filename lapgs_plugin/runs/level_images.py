@@ -148,10 +148,11 @@ class LevelImages:
         if coarse is not None:
             coarse.put(name, images[self._level + 1], (target.shape[1], target.shape[2]))
 
-    def prefetch(self, name: str) -> None:
-        """Start copying a view's images to the device."""
+    def prefetch(self, *names: str) -> None:
+        """Start copying the images of views to the device."""
         for store in self.stores:
-            store.prefetch(name)
+            for name in names:
+                store.prefetch(name)
 
     def get(self, *names: str) -> tuple[Tensor, Tensor | None]:
         """Return I^l of views as `ImageStore.get` does, and Up(I^(l+1)) or None."""

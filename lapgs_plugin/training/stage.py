@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from gsplat.strategy.ops import remove
 from torch import Tensor
+from torch.autograd.grad_mode import set_multithreading_enabled
 
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
@@ -337,8 +338,9 @@ class StageRun:
         if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
             self._note_loss(kept.item(), last, len(views))
         self.breakdown.mark("backward")
-        # The gradient of the sum of the views' losses; for one view, the default of `backward`.
-        loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
+        with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
+            # The gradient of the sum of the views' losses; for one view, the default of `backward`.
+            loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
         self.breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
@@ -371,9 +373,10 @@ class StageRun:
 
     def _prefetch(self, planned: _Planned) -> None:
         """Copy the images of the next launch to the device while this one renders."""
-        for view in planned.views[:AHEAD]:
-            self.images.prefetch(view.name)
-            self.coarser.prefetch(view.name)
+        names = [view.name for view in planned.views[:AHEAD]]
+        self.images.prefetch(*names)
+        for name in names:
+            self.coarser.prefetch(name)
 
     def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
         threshold = self.densifier.score_threshold(iteration)

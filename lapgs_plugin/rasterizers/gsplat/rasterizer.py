@@ -149,8 +149,8 @@ class GsplatRasterizer(Rasterizer):
         if describes:
             return self._render(field, cameras, background, sh_degree)
         image = self._images(field, cameras, background, sh_degree)
-        centres = field.means.new_zeros(len(cameras), 0, 2)
-        return RenderResult(image, None, centres[..., 0].int(), centres)
+        count, like = len(cameras), field.means
+        return RenderResult(image, None, like.new_empty(count, 0, dtype=torch.int32), like.new_empty(count, 0, 2))
 
     def render_image(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
