@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 import triton
-from torch import Tensor
 
 try:
     from triton import knobs
@@ -32,8 +31,8 @@ Start = Callable[..., None]
 _starts: dict[tuple[Any, ...], Start | None] = {}  # None for what only Triton starts
 
 
-def launch(kernel: Any, programs: tuple[int, ...], *arguments: Tensor | float, **constants: Any) -> None:
-    """Start a kernel on the current device and stream.
+def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
+    """Start a kernel on the device of its tensors, in that device's current stream.
 
     Triton looks for the compiled kernel by all that it is compiled for, which takes longer than many kernels run. Here
     the types of the arguments suffice, as long as tensors begin at multiples of 16 bytes and integers fit in 32 bits.
@@ -43,9 +42,14 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Tensor | float, *
         kernel: with parameters that are not `tl.constexpr` first. Integers among them are in `do_not_specialize`, else
             Triton starts it.
         programs: their number in one, two or three dimensions.
-        arguments: tensors on the current device, and numbers.
+        arguments: a tensor, and others on its device, and numbers.
         constants: all others, by name, each always of the same type; and Triton's options. `FUSED` is set.
     """
+    device = arguments[0].get_device()  # -1 for a CPU's, where kernels are interpreted
+    if device >= 0 and device != torch.cuda.current_device():
+        with torch.cuda.device(device):
+            launch(kernel, programs, *arguments, **constants)
+        return
     start = _start_of(kernel, arguments, constants) if STARTS_DIRECTLY else None
     if start is None:
         kernel[programs](*arguments, **constants, **FUSED)
@@ -86,9 +90,7 @@ def _heard(hook: Any) -> bool:
     return bool(getattr(hook, "calls", hook))
 
 
-def _compiled(
-    kernel: Any, device: int, arguments: tuple[Tensor | float, ...], constants: dict[str, Any]
-) -> Start | None:
+def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
     """Compile a kernel, and return what starts it; None if Triton has to."""
     parameters = kernel.params[: len(arguments)]
     specialized = [
@@ -104,7 +106,7 @@ def _compiled(
     last = [constants[name] for name in names] if len(compiled.src.signature) == len(kernel.params) else []
     stream_of = triton.runtime.driver.active.get_current_stream
 
-    def start(programs: tuple[int, ...], arguments: tuple[Tensor | float, ...]) -> None:
+    def start(programs: tuple[int, ...], arguments: tuple[Any, ...]) -> None:
         x, y, z = (*programs, 1, 1)[:3]
         run(x, y, z, stream_of(device), function, metadata, None, None, None, *arguments, *last)
 

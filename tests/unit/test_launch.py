@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 CHECKS = """
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import torch
@@ -21,7 +22,7 @@ from triton.runtime import driver
 from lapgs_plugin.ops import launch as module
 from lapgs_plugin.ops.launch import launch
 
-started, hooks = [], []
+started, hooks, current = [], [], [1]
 
 class Launcher:
     def __init__(self, source, metadata):
@@ -41,7 +42,8 @@ class Utils:
 
 driver.set_active(SimpleNamespace(
     launcher_cls=Launcher, utils=Utils(), get_current_target=lambda: GPUTarget("cuda", 80, 32),
-    get_current_device=lambda: 1, get_current_stream=lambda device: 70 + device, get_device_interface=lambda: None,
+    get_current_device=lambda: current[0], get_current_stream=lambda device: 70 + device,
+    get_device_interface=lambda: None,
 ))
 own, launches = triton.JITFunction.run, []
 
@@ -83,6 +85,23 @@ for _ in range(2):
     check(scale, (3,), values, result, 2**40, 2.5, block=64, adds=2, direct=False)
     check(specialized, (3,), values, 16, block=32, direct=False)
     check(specialized, (3,), values, 17, block=32, direct=False)
+
+class OnSecond(torch.Tensor):
+    def get_device(self):
+        return 1
+
+@contextmanager
+def second(device):
+    current[0] = device
+    yield
+    current[0] = 0
+
+torch.cuda.current_device, torch.cuda.device = lambda: current[0], second
+for at in (0, 1):
+    current[0] = at
+    launch(scale, (3,), values.as_subclass(OnSecond), result, 50, 0.5, block=32, adds=1)
+    assert current[0] == at
+    assert started.pop()[2] == 71
 
 def heard(*args):
     pass

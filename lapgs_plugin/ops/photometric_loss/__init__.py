@@ -41,8 +41,7 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     if prediction.shape[-3] == 3 and triton_works(prediction):
         from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 
-        with torch.cuda.device(prediction.device):  # Triton launches on the current one
-            return photometric_loss_triton(prediction, target, ssim_weight)
+        return photometric_loss_triton(prediction, target, ssim_weight)
     target = decoded(target).to(prediction.dtype)
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu

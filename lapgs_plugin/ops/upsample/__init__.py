@@ -35,8 +35,7 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
     if triton_works(fine):
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
-        with torch.cuda.device(fine.device):  # Triton launches on the current one
-            return upsample_add_triton(pyramid, coarse, fine, clamped)
+        return upsample_add_triton(pyramid, coarse, fine, clamped)
     if clamped:
         return upsample_add(pyramid, coarse, fine).clamp_(0.0, 1.0)
     coarse = coarse.to(fine.dtype)
@@ -68,8 +67,7 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
         return pyramid.up(coarse, size)
     from lapgs_plugin.ops.upsample.in_triton import upsample_triton
 
-    with torch.cuda.device(coarse.device):
-        return upsample_triton(pyramid, coarse, size)
+    return upsample_triton(pyramid, coarse, size)
 
 
 def _fits_numba(image: Tensor) -> bool:
