@@ -280,17 +280,18 @@ def blend_forward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `blend_kernels.blend_forward`; what it keeps for the backward pass is another thing."""
     images, alphas, _ = _blend(*_parts(records), None, None, *size, 16, offsets, flat)
-    return images + (1 - alphas) * background[:, None, None], alphas, background
+    backgrounds = background.expand(len(images), -1).contiguous()
+    return images + (1 - alphas) * backgrounds[:, None, None], alphas, backgrounds
 
 
 def blend_backward(
-    records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, alphas: Tensor, background: Tensor,
+    records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, alphas: Tensor, backgrounds: Tensor,
     by_images: Tensor, absolute: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """As `blend_kernels.blend_backward`; absolute gradients are those of sums."""
     size = images.shape[2], images.shape[1]
     rest = None, *size, 16, offsets, flat, alphas, torch.empty(0), by_images, torch.zeros_like(alphas), absolute
-    whole, means2d, conics, colors, opacities = _blend_back(*_parts(records), background, *rest)
+    whole, means2d, conics, colors, opacities = _blend_back(*_parts(records), backgrounds, *rest)
     found = torch.cat([colors, opacities[..., None], means2d, conics[..., :2]], -1)
     return found, torch.cat([conics[..., 2:], *([] if whole is None else [whole])], -1)
 

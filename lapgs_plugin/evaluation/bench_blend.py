@@ -109,7 +109,7 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
 def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     """Project a field on a GPU for some views, and sort it into tiles."""
     field = field.to("cuda")
-    on_device, background = CameraCache().get(cameras, field.means), torch.zeros(len(cameras), 3, device="cuda")
+    on_device, background = CameraCache().get(cameras, field.means), torch.zeros(3, device="cuda")
     parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
     given = Parameters(*(value.contiguous() for value in parameters))
     seen, tiles, _ = direct.forward(given, on_device, background, field.sh_degree, field.signed, describes=False)
@@ -118,10 +118,11 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
 
 def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
     """Return gsplat's, which take the numbers of a Gaussian one by one."""
-    compiled, none = bindings.compiled_functions(), given.records.new_zeros(len(given.background), size[1], size[0], 1)
+    compiled, none = bindings.compiled_functions(), given.records.new_zeros(len(given.records), size[1], size[0], 1)
     color = slice(COLOR_IN_RECORD, COLOR_IN_RECORD + 3)
     parts = [given.records[..., part].contiguous() for part in (slice(2), slice(2, 5), color, 5)]
-    taken = *parts, given.background, None, *size, bindings.TILE, given.offsets, given.flat
+    background = given.background.expand(len(given.records), -1).contiguous()
+    taken = *parts, background, None, *size, bindings.TILE, given.offsets, given.flat
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         found: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(*taken, *blended[1:], by_images, none, False)

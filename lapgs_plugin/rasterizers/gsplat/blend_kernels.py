@@ -325,11 +325,11 @@ def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tens
     return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
 
 
-@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "of_background"))  # type: ignore[untyped-decorator]  # Triton ships no types
 def _forward_kernel(
     records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
-    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
+    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int, of_background: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
@@ -375,7 +375,7 @@ def _forward_kernel(
 
     pixel = images + 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
     left = 1.0 - tl.sum(cover, 1, keep_dims=True)
-    background += 3 * image
+    background += of_background * image
     tl.store(pixel, tl.sum(red, 1, keep_dims=True) + left * tl.load(background), inside)
     tl.store(pixel + 1, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
     tl.store(pixel + 2, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
@@ -488,7 +488,7 @@ def blend_forward(
     Args:
         records: (c, n, RECORD) float32 of c cameras, or (n, RECORD) of several images' Gaussians in one list; numbers
             of Gaussians in no tile are never read.
-        background: (c, 3) float32.
+        background: (3,) float32, or (c, 3) with one of each image.
         offsets: (c, tiles down, tiles across) int32, the first pair of each tile.
         flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile.
         size: (width, height) of the images.
@@ -512,7 +512,7 @@ def blend_forward(
     launch(
         _forward_kernel, (programs,),
         records, background, offsets, flat, words, images, counts, flat.new_empty(programs, QUEUE.value),
-        *numbers, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
+        *numbers, 3 if background.ndim == 2 else 0, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         num_warps=1, maxnreg=FORWARD_REGISTERS,
     )  # fmt: skip
     return images, counts, words

@@ -71,7 +71,7 @@ def _render(
         field, cameras, background, degree, absgrad: as `render` takes them.
         describes: fill in visible radii and centres, which are empty otherwise.
     """
-    background = background.to(field.means).expand(len(cameras.poses), -1).contiguous()
+    background = background.to(field.means).contiguous()
     parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
     given = Parameters(*(value.contiguous() for value in parameters))  # kernels rely on it
     targets: GradientTargets = []
@@ -91,7 +91,7 @@ def forward(
     """Return Gaussians as the cameras see them; their tiles, sorted; and what `blend_forward` makes of them.
 
     Args:
-        background: (c, 3).
+        background: (3,).
         given, cameras, degree, signed, describes: as `kernels.project` takes them.
     """
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
