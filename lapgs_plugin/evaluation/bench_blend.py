@@ -110,9 +110,9 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     """Project a field on a GPU for some views, and sort it into tiles."""
     field = field.to("cuda")
     on_device, background = CameraCache().get(cameras, field.means), torch.zeros(3, device="cuda")
-    parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
-    given = Parameters(*(value.contiguous() for value in parameters))
-    seen, tiles, _ = direct.forward(given, on_device, background, field.sh_degree, field.signed, describes=False)
+    seen, tiles, _ = direct.forward(
+        Parameters.of(field), on_device, background, field.sh_degree, field.signed, describes=False
+    )
     return Sorted(seen.records, background, *tiles)
 
 

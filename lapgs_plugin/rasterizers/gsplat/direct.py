@@ -72,10 +72,9 @@ def _render(
         describes: fill in visible radii and centres, which are empty otherwise.
     """
     background = background.to(field.means).contiguous()
-    parameters = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
-    given = Parameters(*(value.contiguous() for value in parameters))  # kernels rely on it
+    given = Parameters.of(field)
     targets: GradientTargets = []
-    with torch.cuda.device(field.means.device):  # Triton launches on the current device
+    with torch.cuda.device(field.means.device):  # gsplat's functions launch on the current device
         if is_differentiated(field):
             box: list[Projected] = []
             options = cameras, background, degree, field.signed, describes, absgrad, box, targets

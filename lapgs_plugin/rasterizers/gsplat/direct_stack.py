@@ -35,10 +35,8 @@ class DirectStack(FieldStack):
         self._starts = [0, *accumulate(len(field) for field in fields)]  # of each field in the list, and the end
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
-        self._fields = []
-        for field in fields:
-            parts = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
-            self._fields.append(Parameters(*(part.detach().to(device, copy=True).contiguous() for part in parts)))
+        parts = [Parameters.of(field.detach()) for field in fields]
+        self._fields = [Parameters(*(part.to(device, copy=True) for part in each)) for each in parts]
         if device.type == "cuda":
             torch.cuda.synchronize(device)  # once: from now on every stream may use it
 
@@ -50,7 +48,7 @@ class DirectStack(FieldStack):
         if self._starts[len(cameras)] == 0:
             images = behind[:, None, None].expand(-1, size[1], size[0], -1)
         else:
-            with torch.cuda.device(self._device):  # Triton launches on the current device
+            with torch.cuda.device(self._device):  # gsplat's functions launch on the current device
                 images = self._blended(cameras, behind, size)
         return [
             image[: camera.height, : camera.width].permute(2, 0, 1)

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lapgs_plugin.fields.gaussian_field import GaussianField
+
 RECORD, COLOR_IN_RECORD = 12, 8
 """Numbers of a Gaussian's record, which lies together in memory, and where its colour begins.
 
@@ -14,16 +16,25 @@ They are x, y, conic (a, b, c), opacity, two without meaning, red, green, blue, 
 """
 GRADIENT = 8
 """Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
+ALIGNMENT = 16
+"""Bytes that our kernels read at once."""
 
 
 class Parameters(NamedTuple):
-    """Hold a field's parameters, contiguous float32 on one device."""
+    """Hold a field's parameters, contiguous float32 on one device, each from a multiple of 16 bytes on."""
 
     means: Tensor  # (n, 3)
     quaternions: Tensor  # (n, 4)
     log_scales: Tensor  # (n, 3)
     logits: Tensor  # (n,)
     sh: Tensor  # (n, k, 3)
+
+    @classmethod
+    def of(cls, field: GaussianField) -> Parameters:
+        """Return those of a field, copied where they lie in memory in another way."""
+        parts = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
+        contiguous = [part.contiguous() for part in parts]
+        return cls(*(part if part.data_ptr() % ALIGNMENT == 0 else part.clone() for part in contiguous))
 
 
 class Projected(NamedTuple):

@@ -1,4 +1,4 @@
-"""Validate direct calls of gsplat's kernels against `gsplat.rasterization` on this machine."""
+"""Validate rendering by our kernels against `gsplat.rasterization` on this machine."""
 
 from __future__ import annotations
 
