@@ -292,13 +292,17 @@ def _create(
     require_place(out)
     rasterizer = choose_rasterizer(rasterizer)
     check_storage(settings, training_rasterizer(rasterizer, settings).device)
-    loaded = load_reference(reference)
-    if choose_iterations:
-        settings = _for_photos(len(loaded.train), settings)
-    require_pruning(make_plan(loaded.smallest_size, settings, len(loaded.train)), settings)
+    chosen = settings
+
+    def check(size: tuple[int, int], photos: int) -> None:
+        nonlocal chosen
+        chosen = _for_photos(photos, settings) if choose_iterations else settings
+        require_pruning(make_plan(size, chosen, photos), chosen)
+
+    loaded = load_reference(reference, check)
     found = replace(reference, path=str(Path(reference.path).absolute()), kind=loaded.kind)
-    manifest = Manifest(scene=found, rasterizer=rasterizer, **settings.for_manifest())
-    return RunArchive.create(out, manifest, overwrite), loaded, settings
+    manifest = Manifest(scene=found, rasterizer=rasterizer, **chosen.for_manifest())
+    return RunArchive.create(out, manifest, overwrite), loaded, chosen
 
 
 def _for_photos(photos: int, settings: TrainSettings) -> TrainSettings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,8 +45,8 @@ def run_renderer(
     return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device, finest=finest)
 
 
-def load_reference(reference: SceneReference) -> Scene:
-    """Load the scene that a manifest names, and read it as the manifest says."""
+def load_reference(reference: SceneReference, check: Callable[[tuple[int, int], int], None] | None = None) -> Scene:
+    """Load the scene that a manifest names, and read it as the manifest says; `check` as `load_scene` takes it."""
     return load_scene(
         reference.path,
         resolution=reference.resolution,
@@ -54,6 +54,7 @@ def load_reference(reference: SceneReference) -> Scene:
         eval=reference.eval,
         masks=reference.masks,
         background=reference.background,
+        check=check,
     )
 
 

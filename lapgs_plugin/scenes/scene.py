@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from shlex import quote
@@ -103,6 +103,7 @@ def load_scene(
     masks: str = AUTO,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: bool | ProgressCallback = True,
+    check: Callable[[tuple[int, int], int], None] | None = None,
 ) -> Scene:
     """Load a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
 
@@ -119,6 +120,8 @@ def load_scene(
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
+        check: is called before any image is read, with `Scene.smallest_size` and the number of training views; what it
+            raises ends the loading.
 
     Raises:
         SceneError: the folder, its model, an image or a mask cannot be used.
@@ -135,6 +138,8 @@ def load_scene(
     mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
     cameras = [_sized_camera(frame, rule) for frame in frames]
     refuse_photos(mask_files, {frame.name: frame.path for frame in frames})
+    if check is not None:
+        check(smallest_of(cameras), len(source.train))
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
     if short:
         logger.warning(

@@ -134,6 +134,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert last.startswith("lapgs: ")
     assert message in last
     assert "Traceback" not in ended.stderr
+    assert "Reading images" not in ended.stderr  # nobody waits for a mistake
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
