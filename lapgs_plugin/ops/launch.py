@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
 import triton
 
+
+class _CompilationNotice:
+    """Tell the user once in a process that our kernels are being compiled; loading them from the cache is silent."""
+
+    def __init__(self) -> None:
+        self._printed = False
+
+    def __call__(self, *, src: Any, cache_hit: bool, **others: Any) -> None:
+        ours = getattr(getattr(src, "fn", None), "__module__", "").startswith("lapgs_plugin.")
+        if ours and not (cache_hit or self._printed):
+            self._printed = True
+            print("compiling GPU kernels; later runs load them from a cache ...", file=sys.stderr, flush=True)
+
+
 try:
     from triton import knobs
 
     HOOKS: Any = knobs.runtime
+    knobs.compilation.listener = knobs.compilation.listener or _CompilationNotice()
 except ImportError:  # before Triton 3.4
     from triton.compiler import CompiledKernel
 

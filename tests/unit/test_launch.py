@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -86,6 +87,11 @@ for _ in range(2):
     check(specialized, (3,), values, 16, block=32, direct=False)
     check(specialized, (3,), values, 17, block=32, direct=False)
 
+from lapgs_plugin.ops.regularization.in_triton import add_regularization_triton
+
+for _ in range(2):
+    add_regularization_triton(*(torch.zeros(5, *columns) for columns in ((), (3,), (), (3,))), 0.1, 0.2)
+
 class OnSecond(torch.Tensor):
     def get_device(self):
         return 1
@@ -120,7 +126,11 @@ assert hooks[0] is heard or hooks[0].calls == [heard]
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 def test_a_kernel_is_started_as_triton_starts_it(tmp_path: Path) -> None:
-    script = tmp_path / "checks.py"  # Triton reads the source of kernels
+    script, notice = tmp_path / "checks.py", "compiling GPU kernels"  # Triton reads the source of kernels
     script.write_text(CHECKS)
-    done = subprocess.run([sys.executable, script], check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path / "cache")}
+    for compiles in (True, False):
+        done = subprocess.run([sys.executable, script], check=False, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        says = importlib.util.find_spec("triton.knobs") is not None  # Triton 3.4 and later tell of compilations
+        assert done.stderr.count(notice) == (1 if compiles and says else 0), done.stderr
