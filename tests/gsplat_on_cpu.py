@@ -6,8 +6,9 @@ functions are its own. Backward passes are autograd's, through the forward ones;
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -252,6 +253,16 @@ def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool
     return Projected(radii, means2d, depths, records, largest, centres)
 
 
+def project_into(
+    stacked: Sequence[Tensor], start: int, given: Parameters, cameras: DeviceCameras, camera: int, signed: bool
+) -> None:
+    """As `kernels.project_into`."""
+    one = DeviceCameras(*(part[camera : camera + 1] for part in cameras[:3]), *cameras[3:])
+    seen = project(given, one, math.isqrt(given.sh.shape[1]) - 1, signed)
+    for into, part in zip(stacked, seen[:4], strict=True):
+        into[start : start + len(given.means)] = part[0]
+
+
 def project_backward(
     given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
     found: Tensor, others: Tensor,
@@ -297,7 +308,7 @@ def blend_backward(
 
 
 KERNEL_MODULES = {
-    "kernels": {"project": project, "project_backward": project_backward},
+    "kernels": {"project": project, "project_into": project_into, "project_backward": project_backward},
     "blend_kernels": {"blend_forward": blend_forward, "blend_backward": blend_backward},
 }
 """Functions by the modules of Triton kernels that they replace."""

@@ -24,7 +24,7 @@ from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.speed import measure_speed
-from tests.gsplat_on_cpu import gsplat_on_cpu
+from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
 
 CPU = torch.device("cpu")
@@ -40,11 +40,18 @@ def kernels() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(params=[False, True], ids=["by gsplat's functions", "by stand-ins of our kernels"])
+def direct(request: pytest.FixtureRequest) -> Iterator[bool]:
+    with direct_on_cpu():
+        yield request.param
+
+
 class OnCpu(GsplatRasterizer):
     """gsplat behind our interface on the CPU, where it can only render stacks."""
 
-    def __init__(self) -> None:
+    def __init__(self, direct: bool = False) -> None:
         super().__init__(CPU)
+        self._may_be_direct = self._must_be_direct = direct
         self.stacked: list[int] = []
         self.rendered: list[int] = []
 
@@ -101,16 +108,16 @@ def assert_same(found: Composition, expected: Composition) -> None:
 @pytest.mark.parametrize(
     "counts", [(200,), (300, 100), (10, 1500), (1500, 10), (150, 0, 120), (0, 0), (100, 60, 80, 30)], ids=str
 )
-def test_it_is_the_oracles_composition(counts: Sequence[int]) -> None:
-    rasterizer = OnCpu()
+def test_it_is_the_oracles_composition(counts: Sequence[int], direct: bool) -> None:
+    rasterizer = OnCpu(direct)
     renderer = at_once(hierarchy(counts), rasterizer)
     found = renderer.render(CAMERA)
     assert rasterizer.rendered == [len(counts)], "all in one go"
     assert_same(found, by_the_oracle(renderer).render(CAMERA))
 
 
-def test_degrees_of_colour_may_differ() -> None:
-    renderer = at_once(hierarchy((80, 90, 70), degrees=(2, 0, 3)))
+def test_degrees_of_colour_may_differ(direct: bool) -> None:
+    renderer = at_once(hierarchy((80, 90, 70), degrees=(2, 0, 3)), OnCpu(direct))
     assert_same(renderer.render(CAMERA), by_the_oracle(renderer).render(CAMERA))
 
 
@@ -130,8 +137,8 @@ def test_a_coarse_field_is_culled_and_linearized_for_its_own_size() -> None:
     assert asked == [(27, 19), (53, 37)]
 
 
-def test_gains_and_levels_of_detail() -> None:
-    rasterizer = OnCpu()
+def test_gains_and_levels_of_detail(direct: bool) -> None:
+    rasterizer = OnCpu(direct)
     renderer = at_once(hierarchy((90, 70, 50)), rasterizer)
     expected = by_the_oracle(renderer)
     gains = {2: 0.5, 1: 3.0, 0: 1.7}
@@ -222,9 +229,9 @@ def test_antialiasing_dims_by_the_area_that_was_added() -> None:
         assert float(image[0, 8, 8]) == pytest.approx(expected, rel=1e-5)  # 6.4e-8 seen
 
 
-def test_later_changes_of_a_field_are_not_seen() -> None:
+def test_later_changes_of_a_field_are_not_seen(direct: bool) -> None:
     one = field(40, False)
-    stack = GsplatStack([one], CPU)
+    stack = OnCpu(direct).stack([one])
     (before,) = stack.render([CAMERA], None)
     with torch.no_grad():
         one.sh.zero_()
