@@ -136,7 +136,7 @@ class ImageStore:
         self._where = where
         self._dtype = DTYPES[precision]
         self._device = torch.device(device)
-        self._folder = folder if where == "disk" else None
+        self._folder = folder.absolute() if folder is not None and where == "disk" else None
         self._images: dict[str, _Image] = {}
         self._coming: dict[str, Future[_Arrival]] = {}
         self._stream = (

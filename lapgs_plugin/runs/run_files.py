@@ -26,7 +26,7 @@ class RunFiles:
 
     def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None) -> None:
         """Use `RunArchive.create` or `RunArchive.open`."""
-        self._folder = folder
+        self._given, self._absolute = folder, folder.absolute()
         self._manifest = manifest
         self._lock = lock
 
@@ -54,10 +54,15 @@ class RunFiles:
     @property
     def name(self) -> str:
         """The name of the run folder."""
-        return self._folder.absolute().name
+        return self._absolute.name
+
+    @property
+    def _folder(self) -> Path:
+        """The folder as it was given, or its whole path if the program works in another folder since."""
+        return self._given if self._given.absolute() == self._absolute else self._absolute
 
     def path(self, *parts: str) -> Path:
-        """Return the path of the run folder as it was given, or of something in it."""
+        """Return the path of the run folder as it was given, or of something in it; whole ones after `os.chdir`."""
         return self._folder.joinpath(*parts)
 
     def append_history(self, entry: dict[str, Any]) -> None:

@@ -98,6 +98,22 @@ def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     json.loads((again.path() / "manifest.json").read_text())
 
 
+def test_a_program_may_move_to_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with RunArchive.create("run", manifest()) as archive:
+        archive.finish_level(record(1), level_field(1))
+        reader = RunArchive.open("run")
+        assert archive.path("history.jsonl") == Path("run/history.jsonl")  # as users typed it
+        monkeypatch.chdir(tmp_path / "other")
+        archive.finish_level(record(0), level_field(0))
+        assert torch.equal(reader.field(1).means, level_field(1).means)
+        assert archive.path() == tmp_path / "run"
+        assert reader.name == "run"
+    assert list(Path().iterdir()) == []
+    assert RunArchive.open("../run").available_levels == (1, 0)
+
+
 def test_a_run_without_measurements_has_none(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path, manifest()) as archive:
         assert archive.metrics() is None
