@@ -90,7 +90,7 @@ def _inverse(x: tl.tensor) -> tl.tensor:
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _load_four(start: tl.tensor) -> tl.tensor:
+def load_four(start: tl.tensor) -> tl.tensor:
     """Load four numbers that begin at a multiple of 16 bytes; where compiled, in one instruction."""
     if INTERPRETED:
         return tl.load(start), tl.load(start + 1), tl.load(start + 2), tl.load(start + 3)
@@ -220,8 +220,8 @@ def _reach_kernel(
     while begin < stop:
         there = begin + thread < stop
         gaussian = tl.load(flat + begin + thread, there, tl.load(flat + begin))
-        x, y, a, b = _load_four(records + record * gaussian)
-        c, opacity, _, _ = _load_four(records + record * gaussian + 4)
+        x, y, a, b = load_four(records + record * gaussian)
+        c, opacity, _, _ = load_four(records + record * gaussian + 4)
         x, y = x - (column + 0.5), y - (row + 0.5)
         word = tl.zeros((threads,), tl.int32)  # of the region that has a thread's number in its warp
         for region in tl.static_range(regions):
@@ -294,9 +294,9 @@ def _bucket(
     order = tl.arange(0, SPLAT_LANES)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
     order = tl.broadcast_to(order, (LANES, SPLAT_LANES, splats, 1)) + head
     gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & (QUEUE - 1)), tail > 0, another)
-    x, y, a, b = _load_four(records + record * gaussian)
-    c, opacity, _, _ = _load_four(records + record * gaussian + 4)
-    red, green, blue, _ = _load_four(records + record * gaussian + 8)
+    x, y, a, b = load_four(records + record * gaussian)
+    c, opacity, _, _ = load_four(records + record * gaussian + 4)
+    red, green, blue, _ = load_four(records + record * gaussian + 8)
     tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
     return gaussian, order < tail, x, y, a, b, c, opacity, red, green, blue
 

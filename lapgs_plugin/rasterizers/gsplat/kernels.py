@@ -16,7 +16,7 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.ops.launch import blocks, launch
-from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, _load_four
+from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, load_four
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
@@ -176,7 +176,7 @@ def _store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: t
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _unit_quaternions(quaternions: tl.tensor, row: tl.tensor) -> tl.tensor:
     """Return w, x, y, z of unit length, and one over the length they had."""
-    w, x, y, z = _load_four(quaternions + 4 * row)
+    w, x, y, z = load_four(quaternions + 4 * row)
     inverse = 1.0 / tl.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
@@ -269,9 +269,9 @@ def _color(
     if coefficients % 4 == 0:  # then rows begin at multiples of 16 bytes
         for k in tl.static_range(0, coefficients, 4):
             if k < active:  # coefficients that are not in use are 0 or wait for their degree
-                r0, g0, b0, r1 = _load_four(start + 3 * k)
-                g1, b1, r2, g2 = _load_four(start + 3 * k + 4)
-                b2, r3, g3, b3 = _load_four(start + 3 * k + 8)
+                r0, g0, b0, r1 = load_four(start + 3 * k)
+                g1, b1, r2, g2 = load_four(start + 3 * k + 4)
+                b2, r3, g3, b3 = load_four(start + 3 * k + 8)
                 f0, f1 = _used_basis(k, x, y, z, active), _used_basis(k + 1, x, y, z, active)
                 f2, f3 = _used_basis(k + 2, x, y, z, active), _used_basis(k + 3, x, y, z, active)
                 red += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
@@ -452,10 +452,10 @@ def _shape_gradient_kernel(
         placed = camera * n + row
         visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        _, _, _, of_opacity = _load_four(found + placed * gradient)
-        of_x, of_y, of_wide, of_skew = _load_four(found + placed * gradient + 4)
+        _, _, _, of_opacity = load_four(found + placed * gradient)
+        of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
         of_high = tl.load(others + placed * each)
-        _, _, conic_a, conic_b = _load_four(records + placed * record)
+        _, _, conic_a, conic_b = load_four(records + placed * record)
         conic_c = tl.load(records + placed * record + 4)
         by_opacity += tl.where(visible, of_opacity, 0.0)
         of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
@@ -515,9 +515,9 @@ def _by_direction(
     if coefficients % 4 == 0:
         for k in tl.static_range(0, coefficients, 4):
             if k < active:
-                r0, g0, b0, r1 = _load_four(start + 3 * k)
-                g1, b1, r2, g2 = _load_four(start + 3 * k + 4)
-                b2, r3, g3, b3 = _load_four(start + 3 * k + 8)
+                r0, g0, b0, r1 = load_four(start + 3 * k)
+                g1, b1, r2, g2 = load_four(start + 3 * k + 4)
+                b2, r3, g3, b3 = load_four(start + 3 * k + 8)
                 x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
                 x1, y1, z1 = _slopes(k + 1, x, y, z, active, r1, g1, b1, of_red, of_green, of_blue)
                 x2, y2, z2 = _slopes(k + 2, x, y, z, active, r2, g2, b2, of_red, of_green, of_blue)
@@ -584,8 +584,8 @@ def _color_gradient_kernel(
         placed = camera * n + row
         visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        of_red, of_green, of_blue, _ = _load_four(found + placed * gradient)
-        color_r, color_g, color_b, _ = _load_four(records + placed * record + color_in_record)
+        of_red, of_green, of_blue, _ = load_four(found + placed * gradient)
+        color_r, color_g, color_b, _ = load_four(records + placed * record + color_in_record)
         of_red = tl.where(visible & ((signed != 0) | (color_r > 0.0)), of_red, 0.0)
         of_green = tl.where(visible & ((signed != 0) | (color_g > 0.0)), of_green, 0.0)
         of_blue = tl.where(visible & ((signed != 0) | (color_b > 0.0)), of_blue, 0.0)
