@@ -33,6 +33,7 @@ LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
 """A warp's threads: this many columns of pixels by this many Gaussians."""
 AT_ONCE, QUEUE = tl.constexpr(2 * WARP), tl.constexpr(4 * WARP)
 """Pairs that a warp reads at once, and places in its queue: for as many and almost a bucket."""
+OF_GRADIENT = tl.constexpr(GRADIENT)
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST = tl.constexpr(0.999)
@@ -406,7 +407,7 @@ def _add_gradients(
     first = _sum_of_pair(of_red, of_blue, 1)
     second = _sum_of_pair(of_green, of_opacity, 1)
     lane = tl.arange(0, LANES)[:, None, None, None]
-    start = gradients + 8 * gaussian
+    start = gradients + OF_GRADIENT * gaussian
     tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
     tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
     value = tl.sum(0.5 * by_yy, 0, keep_dims=True)

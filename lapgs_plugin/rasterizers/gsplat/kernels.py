@@ -192,9 +192,15 @@ def _rotation(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tens
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
-def _scales(log_scales: tl.tensor, row: tl.tensor) -> tl.tensor:
-    start = log_scales + 3 * row
-    return tl.exp(tl.load(start)), tl.exp(tl.load(start + 1)), tl.exp(tl.load(start + 2))
+def _load_three(start: tl.tensor) -> tl.tensor:
+    return tl.load(start), tl.load(start + 1), tl.load(start + 2)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _store_three(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, wanted: tl.tensor) -> None:
+    tl.store(start, a, wanted)
+    tl.store(start + 1, b, wanted)
+    tl.store(start + 2, c, wanted)
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -207,6 +213,31 @@ def _covariance(
         a * a + b * b + c * c, a * d + b * e + c * f, a * g + b * h + c * i,
         d * d + e * e + f * f, d * g + e * h + f * i, g * g + h * h + i * i,
     )  # fmt: skip
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _shape(quaternions: tl.tensor, log_scales: tl.tensor, row: tl.tensor) -> tl.tensor:
+    """Return w, x, y, z of unit quaternions and one over their length, scales, and covariances as `_covariance` has."""
+    w, x, y, z, length = _unit_quaternions(quaternions, row)
+    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
+    s0, s1, s2 = _load_three(log_scales + 3 * row)
+    s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
+    xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
+    return w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _is_visible(radii: tl.tensor, placed: tl.tensor) -> tl.tensor:
+    return (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _direction(centre: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, visible: tl.tensor) -> tl.tensor:
+    """Return unit directions from a camera's centre to visible means, and one over their distances."""
+    centre_x, centre_y, centre_z = _load_three(centre)
+    x, y, z = x - centre_x, y - centre_y, z - centre_z
+    near = 1.0 / tl.sqrt(tl.where(visible, x * x + y * y + z * z, 1.0))
+    return x * near, y * near, z * near, near
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -280,17 +311,22 @@ def _color(
     else:
         for k in tl.static_range(coefficients):
             factor = _used_basis(k, x, y, z, active)
-            red += factor * tl.load(start + 3 * k)
-            green += factor * tl.load(start + 3 * k + 1)
-            blue += factor * tl.load(start + 3 * k + 2)
+            r0, g0, b0 = _load_three(start + 3 * k)
+            red += factor * r0
+            green += factor * g0
+            blue += factor * b0
     return red, green, blue
+
+
+@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+def _is_used(k: tl.constexpr, active: int) -> tl.tensor:
+    return tl.full((1,), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
 
 
 @triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
 def _used_basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int) -> tl.tensor:
     """Return the k-th spherical harmonic, 0 if it is not active."""
-    used = tl.full((1,), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
-    return tl.where(used, _basis(k, x, y, z), 0.0)
+    return tl.where(_is_used(k, active), _basis(k, x, y, z), 0.0)
 
 
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -304,11 +340,8 @@ def _project_kernel(
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
-    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
-    w, x, y, z, _ = _unit_quaternions(quaternions, row)
-    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
-    s0, s1, s2 = _scales(log_scales, row)
-    xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
+    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
+    _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(quaternions, log_scales, row)
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
     reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
     camera, placed = first, start + rows
@@ -331,11 +364,9 @@ def _project_kernel(
         visible = visible & (pixel_x + across > 0.0) & (pixel_x - across < width)
         visible = visible & (pixel_y + down > 0.0) & (pixel_y - down < height)
 
-        away_x, away_y = mean_x - tl.load(centres + 3 * camera), mean_y - tl.load(centres + 3 * camera + 1)
-        away_z = mean_z - tl.load(centres + 3 * camera + 2)
-        near = 1.0 / tl.sqrt(tl.where(visible, away_x * away_x + away_y * away_y + away_z * away_z, 1.0))
+        x, y, z, _ = _direction(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
         colored = tl.where(visible, row, 0)  # so that memory of others is not read
-        red, green, blue = _color(sh, colored, away_x * near, away_y * near, away_z * near, active, coefficients)
+        red, green, blue = _color(sh, colored, x, y, z, active, coefficients)
         if signed == 0:
             red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
 
@@ -416,9 +447,8 @@ def _store_shape_gradients(
     vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, b, e, h)
     wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
     s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
-    tl.store(by_log_scale + 3 * rows, s0 * (ux * a + uy * d + uz * g), here)
-    tl.store(by_log_scale + 3 * rows + 1, s1 * (vx * b + vy * e + vz * h), here)
-    tl.store(by_log_scale + 3 * rows + 2, s2 * (wx * c + wy * f + wz * i), here)
+    by_0, by_1, by_2 = ux * a + uy * d + uz * g, vx * b + vy * e + vz * h, wx * c + wy * f + wz * i
+    _store_three(by_log_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
     ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
     of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
     of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
@@ -439,18 +469,15 @@ def _shape_gradient_kernel(
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
-    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
-    w, x, y, z, length = _unit_quaternions(quaternions, row)
-    a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
-    s0, s1, s2 = _scales(log_scales, row)
-    xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
+    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
+    w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz = _shape(quaternions, log_scales, row)
     none = 0.0 * mean_x
     by_x, by_y, by_z, by_opacity = none, none, none, none
     by_xx, by_xy, by_xz, by_yy, by_yz, by_zz = none, none, none, none, none, none
     camera = 0
     while camera < cameras:
         placed = camera * n + row
-        visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
+        visible = _is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
         _, _, _, of_opacity = load_four(found + placed * gradient)
         of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
@@ -482,9 +509,7 @@ def _shape_gradient_kernel(
         by_y += down
         by_z += ahead
         camera += 1
-    tl.store(by_mean + 3 * rows, by_x, here)
-    tl.store(by_mean + 3 * rows + 1, by_y, here)
-    tl.store(by_mean + 3 * rows + 2, by_z, here)
+    _store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
     opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
     tl.store(by_logit + rows, by_opacity * opacity * (1.0 - opacity), here)
     _store_shape_gradients(
@@ -500,7 +525,7 @@ def _slopes(
 ) -> tl.tensor:  # fmt: skip
     """Return what the k-th spherical harmonic adds to the gradient by x, y and z of the direction."""
     weight = red * of_red + green * of_green + blue * of_blue
-    weight = tl.where(tl.full((1,), k, tl.int32) < active, weight, 0.0)
+    weight = tl.where(_is_used(k, active), weight, 0.0)
     return _basis_x(k, x, y, z) * weight, _basis_y(k, x, y, z) * weight, _basis_z(k, x, y, z) * weight
 
 
@@ -527,7 +552,7 @@ def _by_direction(
                 by_z += z0 + z1 + z2 + z3
     else:
         for k in tl.static_range(coefficients):
-            r0, g0, b0 = tl.load(start + 3 * k), tl.load(start + 3 * k + 1), tl.load(start + 3 * k + 2)
+            r0, g0, b0 = _load_three(start + 3 * k)
             x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
             by_x += x0
             by_y += y0
@@ -559,9 +584,7 @@ def _store_sh(
     else:
         for i in tl.static_range(coefficients):
             into = by_sh + (rows * coefficients + i) * 3
-            tl.store(into, _one_of(red, k, i), here)
-            tl.store(into + 1, _one_of(green, k, i), here)
-            tl.store(into + 2, _one_of(blue, k, i), here)
+            _store_three(into, _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), here)
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
@@ -577,22 +600,19 @@ def _color_gradient_kernel(
     k = tl.arange(0, padded)[:, None]  # of sums, which a thread has in its registers
     red = tl.zeros((padded, block), tl.float32)
     green, blue = tl.zeros_like(red), tl.zeros_like(red)
-    mean_x, mean_y, mean_z = tl.load(means + 3 * row), tl.load(means + 3 * row + 1), tl.load(means + 3 * row + 2)
+    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
     by_x, by_y, by_z = 0.0 * mean_x, 0.0 * mean_x, 0.0 * mean_x
     camera = 0
     while camera < cameras:
         placed = camera * n + row
-        visible = (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
+        visible = _is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
         of_red, of_green, of_blue, _ = load_four(found + placed * gradient)
         color_r, color_g, color_b, _ = load_four(records + placed * record + color_in_record)
         of_red = tl.where(visible & ((signed != 0) | (color_r > 0.0)), of_red, 0.0)
         of_green = tl.where(visible & ((signed != 0) | (color_g > 0.0)), of_green, 0.0)
         of_blue = tl.where(visible & ((signed != 0) | (color_b > 0.0)), of_blue, 0.0)
-        x, y = mean_x - tl.load(centres + 3 * camera), mean_y - tl.load(centres + 3 * camera + 1)
-        z = mean_z - tl.load(centres + 3 * camera + 2)
-        near = 1.0 / tl.sqrt(tl.where(visible, x * x + y * y + z * z, 1.0))
-        x, y, z = x * near, y * near, z * near
+        x, y, z, near = _direction(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
         basis = tl.zeros_like(red)
         for i in tl.static_range(coefficients):
             basis = tl.where(k == i, _used_basis(i, x, y, z, active)[None], basis)
@@ -609,9 +629,8 @@ def _color_gradient_kernel(
         camera += 1
     _store_sh(by_sh, rows, red, green, blue, k, here, coefficients)
     if coefficients > 1:
-        tl.store(by_mean + 3 * rows, tl.load(by_mean + 3 * row) + by_x, here)
-        tl.store(by_mean + 3 * rows + 1, tl.load(by_mean + 3 * row + 1) + by_y, here)
-        tl.store(by_mean + 3 * rows + 2, tl.load(by_mean + 3 * row + 2) + by_z, here)
+        before_x, before_y, before_z = _load_three(by_mean + 3 * row)
+        _store_three(by_mean + 3 * rows, before_x + by_x, before_y + by_y, before_z + by_z, here)
 
 
 def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
