@@ -44,11 +44,13 @@ class BlendTime:
 class Kernels(NamedTuple):
     """Blend with `forward`, whose first result is images (c, h, w, 3), and return gradients with `backward`.
 
-    It takes all results of `forward`, and a gradient by the images.
+    It takes all results of `forward`, and a gradient by the images. `parts` makes gradients by centres, conics, colours
+    and opacities of its results.
     """
 
     forward: Callable[[], Sequence[Tensor]]
     backward: Callable[[Sequence[Tensor], Tensor], Sequence[Tensor]]
+    parts: Callable[[Sequence[Tensor]], Sequence[Tensor]]
 
 
 class Sorted(NamedTuple):
@@ -126,9 +128,9 @@ def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         found: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(*taken, *blended[1:], by_images, none, False)
-        return found[1:]
+        return found
 
-    return Kernels(partial(compiled.rasterize_to_pixels_3dgs_fwd, *taken), backward)
+    return Kernels(partial(compiled.rasterize_to_pixels_3dgs_fwd, *taken), backward, lambda found: found[1:])
 
 
 def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
@@ -140,7 +142,11 @@ def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
         rest = given.offsets, given.flat, images, counts, words, by_images
         return blend_backward(given.records, *rest, False, shape)
 
-    return Kernels(partial(blend_forward, *given, size, shape), backward)
+    def parts(found: Sequence[Tensor]) -> Sequence[Tensor]:
+        first, rest = found
+        return first[..., 4:6], torch.cat([first[..., 6:], rest[..., :1]], -1), first[..., :3], first[..., 3]
+
+    return Kernels(partial(blend_forward, *given, size, shape), backward, parts)
 
 
 def run_case(
@@ -155,11 +161,7 @@ def run_case(
     results = {}
     for name, one in kernels.items():
         made = one.forward()
-        by = one.backward(made, by_images)
-        if name != "gsplat":  # in rows of several numbers
-            first, rest = by
-            by = first[..., 4:6], torch.cat([first[..., 6:], rest[..., :1]], -1), first[..., :3], first[..., 3]
-        results[name] = made, (made[0], *by)
+        results[name] = made, (made[0], *one.parts(one.backward(made, by_images)))
     forward: dict[str, list[float]] = {name: [] for name in kernels}
     backward: dict[str, list[float]] = {name: [] for name in kernels}
     for _ in range(repeats):

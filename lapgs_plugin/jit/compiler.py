@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
@@ -15,6 +14,7 @@ import numba.core.caching
 import numba.core.event
 
 from lapgs_plugin.jit import lowering as _lowering  # noqa: F401  # registers the functions of `lanes` with Numba
+from lapgs_plugin.jit.notice import say_compiling
 
 # Versions of Numba differ in how much they annotate.
 njit: Any = numba.njit
@@ -73,16 +73,11 @@ def _helpers_stamp(folder: Path) -> str:
 
 
 class _CompilationNotice(event.Listener):  # type: ignore[misc]  # see above
-    """Tell the user once in a process that kernels are being compiled; loading them from the cache is silent."""
-
-    def __init__(self) -> None:
-        self._printed = False
+    """Tell the user that kernels are being compiled; loading them from the cache is silent."""
 
     def on_start(self, event: Any) -> None:
-        ours = event.data["dispatcher"].py_func.__module__.startswith("lapgs_plugin.")
-        if ours and not self._printed:
-            self._printed = True
-            print("compiling CPU kernels; later runs load them from a cache ...", file=sys.stderr, flush=True)
+        if event.data["dispatcher"].py_func.__module__.startswith("lapgs_plugin."):
+            say_compiling("CPU")
 
     def on_end(self, event: Any) -> None:
         pass

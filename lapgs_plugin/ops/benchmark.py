@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from statistics import median
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -32,6 +32,7 @@ from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_to
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
 from lapgs_plugin.ops.position_noise.in_torch import displacements
 from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch
+from lapgs_plugin.ops.self_check import SelfCheck
 
 NUMBA = "Numba"
 TORCH = "PyTorch"
@@ -46,6 +47,7 @@ class Version(NamedTuple):
 
 
 Versions = dict[str, Version]
+_Operation = TypeVar("_Operation", bound=Callable[..., object])
 
 
 @dataclass(frozen=True)
@@ -220,6 +222,16 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     return versions
 
 
+def _with_triton(
+    ours: str, works: SelfCheck, version: Callable[[_Operation], Version], plain: _Operation, own: _Operation
+) -> Versions:
+    """Return PyTorch's version and, on a GPU where it works, the one that calls our kernel."""
+    versions = {TORCH: version(plain)}
+    if ours != NUMBA and works():
+        versions[ours] = version(own)
+    return versions
+
+
 def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
     gradient = torch.randn(gaussians, 2, generator=generator).to(device)
@@ -229,30 +241,30 @@ def _statistics_versions(ours: str, gaussians: int, device: torch.device) -> Ver
         norms, counts = (torch.zeros(gaussians, device=device) for _ in range(2))
         return Version(lambda: add(gradient, radii, (2, 2), norms, counts), norms)
 
-    versions = {TORCH: version(add_statistics_torch)}
-    if ours != NUMBA and densification_statistics.triton_works():
-        versions[ours] = version(densification_statistics.add_statistics)
-    return versions
+    return _with_triton(
+        ours,
+        densification_statistics.triton_works,
+        version,
+        add_statistics_torch,
+        densification_statistics.add_statistics,
+    )
 
 
 def _regularization_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     generator = torch.Generator().manual_seed(0)
     starts = [torch.randn(gaussians, *columns, generator=generator).to(device) for columns in ((), (3,))]
 
-    def in_torch(logits: Tensor, log_scales: Tensor, *weights: float) -> None:
+    def in_torch(logits: Tensor, log_scales: Tensor, opacity_weight: float, scale_weight: float) -> None:
         assert logits.grad is not None
         assert log_scales.grad is not None
-        add_regularization_torch(logits, log_scales, logits.grad, log_scales.grad, *weights)
+        add_regularization_torch(logits, log_scales, logits.grad, log_scales.grad, opacity_weight, scale_weight)
 
     def version(add: Callable[[Tensor, Tensor, float, float], None]) -> Version:
         logits, log_scales = (start.clone() for start in starts)
         logits.grad, log_scales.grad = torch.zeros_like(logits), torch.zeros_like(log_scales)
         return Version(lambda: add(logits, log_scales, 1.0, 1.0), log_scales.grad)
 
-    versions = {TORCH: version(in_torch)}
-    if ours != NUMBA and regularization.triton_works():
-        versions[ours] = version(regularization.add_regularization)
-    return versions
+    return _with_triton(ours, regularization.triton_works, version, in_torch, regularization.add_regularization)
 
 
 def _noise_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
@@ -269,7 +281,4 @@ def _noise_versions(ours: str, gaussians: int, device: torch.device) -> Versions
         # By nothing, because each version draws noise of its own; it takes as long.
         return Version(lambda: add(means, quaternions, log_scales, logits, 0.0), means)
 
-    versions = {TORCH: version(in_torch)}
-    if ours != NUMBA and position_noise.triton_works():
-        versions[ours] = version(position_noise.add_noise)
-    return versions
+    return _with_triton(ours, position_noise.triton_works, version, in_torch, position_noise.add_noise)

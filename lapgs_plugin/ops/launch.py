@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
 import triton
 
+from lapgs_plugin.jit.notice import say_compiling
 
-class _CompilationNotice:
-    """Tell the user once in a process that our kernels are being compiled; loading them from the cache is silent."""
 
-    def __init__(self) -> None:
-        self._printed = False
-
-    def __call__(self, *, src: Any, cache_hit: bool, **others: Any) -> None:
-        ours = getattr(getattr(src, "fn", None), "__module__", "").startswith("lapgs_plugin.")
-        if ours and not (cache_hit or self._printed):
-            self._printed = True
-            print("compiling GPU kernels; later runs load them from a cache ...", file=sys.stderr, flush=True)
+def _say_if_compiled(*, src: Any, cache_hit: bool, **others: Any) -> None:
+    """Tell the user that our kernels are being compiled; loading them from the cache is silent."""
+    if not cache_hit and getattr(getattr(src, "fn", None), "__module__", "").startswith("lapgs_plugin."):
+        say_compiling("GPU")
 
 
 try:
     from triton import knobs
 
     HOOKS: Any = knobs.runtime
-    knobs.compilation.listener = knobs.compilation.listener or _CompilationNotice()
+    knobs.compilation.listener = knobs.compilation.listener or _say_if_compiled
 except ImportError:  # before Triton 3.4
     from triton.compiler import CompiledKernel
 
@@ -127,6 +121,18 @@ def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: d
         run(x, y, z, stream_of(device), function, metadata, None, None, None, *arguments, *last)
 
     return start
+
+
+MOST_ROWS, ENOUGH_PROGRAMS = 64, 1500
+"""Rows of an image for a program; it takes fewer where an image would make less than so many programs."""
+
+
+def rows_of_program(height: int, beside: int, least: int) -> int:
+    """Return the rows of an image that a program takes, from `least` on; `beside` is the number of programs a row."""
+    rows = MOST_ROWS
+    while rows > least and beside * blocks(height, rows) < ENOUGH_PROGRAMS:
+        rows //= 2
+    return rows
 
 
 def blocks(count: int, block: int) -> int:

@@ -16,13 +16,13 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.ops.launch import blocks, launch
+from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
 
 COLORS = 3
 BLOCK = 128
-MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 16, 1500
-"""Rows of a program, which reads ten more. It takes fewer where an image would make less than so many programs."""
+LEAST_ROWS = 16
+"""Fewest rows of a program, which reads ten more."""
 
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
@@ -219,9 +219,7 @@ def _launch_of(
     """Return the programs of a launch, and the numbers and constants that both kernels share."""
     b, _, h, w = prediction.shape
     strips = blocks(blocks(w, 2) * COLORS, BLOCK)
-    rows = MOST_ROWS
-    while rows > LEAST_ROWS and strips * blocks(h, rows) * b < ENOUGH_PROGRAMS:
-        rows //= 2
+    rows = rows_of_program(h, strips * b, LEAST_ROWS)
     each = 1 / prediction.numel()
     scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
     weights = (1 - ssim_weight) * each, ssim_weight * each

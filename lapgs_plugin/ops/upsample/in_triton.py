@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
-from lapgs_plugin.ops.launch import blocks, launch
+from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
 
 BLOCK = 128
-MOST_ROWS, LEAST_ROWS, ENOUGH_PROGRAMS = 64, 8, 1500
-"""Rows of a program. It takes fewer where an image would make less than so many programs."""
+LEAST_ROWS = 8
+"""Fewest rows of a program."""
 MOST_TAPS, MOST_TRANSPOSED = 5, 12
 """Upper bounds: coarse samples in the sum of a fine one, and fine samples whose sums a coarse one is in."""
 
@@ -143,9 +143,8 @@ def _filter(
     given = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
     b, planes, height, width = images[2].shape
-    strips, count = blocks(planes * width, BLOCK), MOST_ROWS
-    while count > LEAST_ROWS and strips * blocks(height, count) * b < ENOUGH_PROGRAMS:
-        count //= 2
+    strips = blocks(planes * width, BLOCK)
+    count = rows_of_program(height, strips * b, LEAST_ROWS)
     source_column, added_column, out_column = (image.stride(3) for image in images)
     launch(
         _kernel, (strips, blocks(height, count), b),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
+import torch
 from torch import Tensor
 
 TILE = 16
@@ -30,11 +31,12 @@ def sort_into_tiles(
     compiled = compiled_functions()
     radii, means2d, depths = projected[:3]
     across, down = (math.ceil(side / TILE) for side in size)
-    # gsplat also takes the index of each Gaussian, but does not use it.
-    _, pairs, flat = compiled.intersect_tile(
-        means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
-    )
-    return compiled.intersect_offset(pairs, count, across, down), flat
+    with torch.cuda.device(radii.device):  # gsplat's functions launch on the current one
+        # gsplat also takes the index of each Gaussian, but does not use it.
+        _, pairs, flat = compiled.intersect_tile(
+            means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
+        )
+        return compiled.intersect_offset(pairs, count, across, down), flat
 
 
 @lru_cache(maxsize=1)

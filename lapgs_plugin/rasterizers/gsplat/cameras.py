@@ -57,7 +57,7 @@ class CameraCache:
         copied = self._copied.get(id(camera))
         if copied is None or copied.camera() is not camera or copied.pose.device != like.device:
             with torch.inference_mode(False):  # cached for later calls, which may need gradients
-                poses, intrinsics, centres = (value.contiguous() for value in cameras_on_device([camera], like))
+                poses, intrinsics, centres = cameras_on_device([camera], like)
                 flat = poses.view(-1), intrinsics.view(-1), centres.view(-1)
             key, cache = id(camera), self._copied
             known = weakref.ref(camera, lambda _: cache.pop(key, None))
@@ -67,7 +67,10 @@ class CameraCache:
 
 
 def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU."""
+    """Return poses (b, 4, 4), intrinsics (b, 3, 3) and centres (b, 3) beside `like`, without waiting for its GPU.
+
+    They are contiguous.
+    """
     poses = [camera.world_to_camera for camera in cameras]
     elsewhere = any(pose.device.type != "cpu" for pose in poses)
     # All numbers in one tensor: each small copy costs time in every frame. Each part of a single camera's begins at a
@@ -79,10 +82,10 @@ def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, 
     # Page-locked, because a copy from other memory would wait for the GPU.
     numbers = torch.tensor(rows, dtype=like.dtype, pin_memory=like.device.type == "cuda")
     numbers = numbers.to(like.device, non_blocking=True)  # (b, 31) or (b, 9)
-    intrinsics = numbers[:, :9].reshape(-1, 3, 3)
+    intrinsics = numbers[:, :9].contiguous().view(-1, 3, 3)
     if elsewhere:
         return torch.stack(poses).to(like), intrinsics, torch.stack([camera.position for camera in cameras]).to(like)
-    return numbers[:, 12:28].reshape(-1, 4, 4), intrinsics, numbers[:, 28:]
+    return numbers[:, 12:28].contiguous().view(-1, 4, 4), intrinsics, numbers[:, 28:].contiguous()
 
 
 def _pose_numbers(pose: Tensor) -> list[float]:

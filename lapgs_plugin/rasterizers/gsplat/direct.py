@@ -74,13 +74,12 @@ def _render(
     background = background.to(field.means).contiguous()
     given = Parameters.of(field)
     targets: GradientTargets = []
-    with torch.cuda.device(field.means.device):  # gsplat's functions launch on the current device
-        if is_differentiated(field):
-            box: list[Projected] = []
-            options = cameras, background, degree, field.signed, describes, absgrad, box, targets
-            image: Tensor = _Render.apply(*given, *options)  # type: ignore[no-untyped-call]  # torch's
-            return image, box[0], targets
-        seen, _, (images, *_) = forward(given, cameras, background, degree, field.signed, describes)
+    if is_differentiated(field):
+        box: list[Projected] = []
+        options = cameras, background, degree, field.signed, describes, absgrad, box, targets
+        image: Tensor = _Render.apply(*given, *options)  # type: ignore[no-untyped-call]  # torch's
+        return image, box[0], targets
+    seen, _, (images, *_) = forward(given, cameras, background, degree, field.signed, describes)
     return _channels_first(images), seen, targets
 
 

@@ -48,8 +48,7 @@ class DirectStack(FieldStack):
         if self._starts[len(cameras)] == 0:
             images = behind[:, None, None].expand(-1, size[1], size[0], -1)
         else:
-            with torch.cuda.device(self._device):  # gsplat's functions launch on the current device
-                images = self._blended(cameras, behind, size)
+            images = self._blended(cameras, behind, size)
         return [
             image[: camera.height, : camera.width].permute(2, 0, 1)
             for image, camera in zip(images, cameras, strict=True)
@@ -64,7 +63,7 @@ class DirectStack(FieldStack):
         radii = torch.empty(count, 2, dtype=torch.int32, device=self._device)
         means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
         stacked = radii, means2d, depths, records
-        poses, intrinsics, centres = (each.contiguous() for each in cameras_on_device(cameras, like))
+        poses, intrinsics, centres = cameras_on_device(cameras, like)
         for i, (camera, field) in enumerate(zip(cameras, self._fields, strict=False)):
             if len(field.means) > 0:
                 on_device = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
