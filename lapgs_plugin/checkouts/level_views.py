@@ -250,10 +250,10 @@ class PrefetchingViews(list[Any]):
 
     Args:
         views: views in the scene's order.
-        prefetch: called with the next view.
+        prefetch: called after each draw with a function that returns the next view, which takes a while.
     """
 
-    def __init__(self, views: Iterable[Any], prefetch: Callable[[Any], None]) -> None:
+    def __init__(self, views: Iterable[Any], prefetch: Callable[[Callable[[], Any]], None]) -> None:
         super().__init__(views)
         self._prefetch = prefetch
 
@@ -265,9 +265,12 @@ class PrefetchingViews(list[Any]):
         """Remove and return a view, and prefetch the next one."""
         drawn = super().pop(index)
         if self:
-            _PEEK.setstate(random.getstate())
-            self._prefetch(self[_PEEK.randint(0, len(self) - 1)])
+            self._prefetch(self._next)
         return drawn
+
+    def _next(self) -> Any:
+        _PEEK.setstate(random.getstate())
+        return self[_PEEK.randint(0, len(self) - 1)]
 
 
 _PEEK = random.Random()

@@ -114,6 +114,8 @@ class HierarchyDriver:
         self._since = _now_in_files()
         with (
             Attachment(self._replacements.all()),
+            # Handing a backward pass to a thread of autograd's and waiting for it takes up to a tenth of an iteration.
+            torch.autograd.set_multithreading_enabled(False),
             self._context.parts.watching_optimizers(),
             counting_steps(self._adapter.profile, lambda: self._context.stage),
         ):

@@ -395,6 +395,8 @@ class _DryStage:
 class _Nothing:
     """Return black images as predictions of coarser levels."""
 
+    where = "gpu"  # nothing has to be copied
+
     def __init__(self, sizes: Mapping[str, tuple[int, int]], device: torch.device) -> None:
         self._sizes, self._device = sizes, device
 

@@ -18,6 +18,7 @@ from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ADAM_EPS
+from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.runner.context import FinishedStage, RunContext, TrainingRun
@@ -52,6 +53,8 @@ class JointLevels:
         finished: the coarser stages, coarsest first.
         views: of the running stage.
     """
+
+    where = "gpu"  # nothing has to be copied
 
     def __init__(
         self, context: RunContext, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews
@@ -88,8 +91,9 @@ class JointLevels:
                 if name in GROUPS  # archived fields have none of a fork's other parameters
             ]
             if groups:
-                on_gpu = self._context.device.type == "cuda"
-                following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=on_gpu)
+                following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS)
+                if self._context.device.type == "cuda":
+                    fuse_steps(following)
                 leading.register_step_post_hook(_Follow(following))
 
     def prefetch(self, key: str) -> None:

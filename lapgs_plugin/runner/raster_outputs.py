@@ -47,6 +47,8 @@ class RasterOutputs:
     def image(self) -> Tensor:
         """The image (3, h, w)."""
         stored = self._stored
+        if stored.ndim == 3 and not self.channels_last and self.rest is None:
+            return stored  # views would be steps of the backward pass
         image = stored.reshape(stored.shape[-3:])  # some have a leading axis for several views
         return image.permute(2, 0, 1) if self.channels_last else image[:3]
 
@@ -63,7 +65,10 @@ class RasterOutputs:
         """Return the outputs with another image (3, h, w) in the place and shape of the first."""
         if self.rest is not None:
             image = torch.cat([image.expand(*self.rest.shape[:-3], -1, -1, -1), self.rest], -3)
-        image = (image.permute(1, 2, 0) if self.channels_last else image).reshape(self._stored.shape)
+        if self.channels_last:
+            image = image.permute(1, 2, 0)
+        if image.shape != self._stored.shape:
+            image = image.reshape(self._stored.shape)
         return image if self.place is None else _with_item(self.outputs, self.place, image)
 
     @property

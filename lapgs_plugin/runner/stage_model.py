@@ -13,6 +13,7 @@ from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import RunContext, StageResult
 from lapgs_plugin.runner.object_values import fields_of, with_values
@@ -72,7 +73,7 @@ class StageModel:
             if inherit and self._before is not None:
                 self._inherit_moments(optimizer, self._before.moments)
             if self._options.fused_adam and self._device.type == "cuda":
-                _fuse_steps(optimizer)
+                fuse_steps(optimizer)
 
     def carried(self, gaussians: Any) -> dict[str, Any]:
         """Return attributes for the next model besides its Gaussians. SH of a residual start again at degree 0."""
@@ -133,14 +134,3 @@ def _scale_sh_rate(optimizers: Sequence[torch.optim.Optimizer], factor: float) -
         )
     for group in groups:
         group["lr"] *= factor
-
-
-def _fuse_steps(optimizer: torch.optim.Optimizer) -> None:
-    """Let a plain Adam step each tensor in one kernel instead of a dozen; results differ by rounding."""
-    if type(optimizer) is not torch.optim.Adam:
-        return
-    for group in optimizer.param_groups:
-        group["fused"], group["foreach"] = True, False
-        for parameter in group["params"]:
-            if "step" in (state := optimizer.state.get(parameter, {})):
-                state["step"] = state["step"].to(parameter.device)

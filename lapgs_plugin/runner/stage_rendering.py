@@ -30,6 +30,10 @@ GREY = 0.5
 class Predictions(Protocol):
     """Return upsampled predictions of coarser levels by view: cached images, or renders of finished fields."""
 
+    @property
+    def where(self) -> str:
+        """Where they wait, as `ImageStore.where`."""
+
     def prefetch(self, key: str, /) -> None:
         """Prepare for a `get` of this view."""
 
@@ -130,6 +134,12 @@ class StageRendering:
         for each in (*stores, self.accumulated if key in self.composed else self._below_target):
             if each is not None:
                 each.prefetch(key)
+
+    @property
+    def prefetches(self) -> bool:
+        """Whether images of the running stage are anywhere but on the GPU."""
+        stores = () if self.images is None else self.images.stores
+        return any(each is not None and each.where != "gpu" for each in (*stores, self.accumulated))
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -87,10 +88,10 @@ class StageViews:
     def train_views(self) -> list[Any]:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
 
-        def prefetch(view: Any) -> None:
+        def prefetch(next_view: Callable[[], Any]) -> None:
             rendering = self._context.wrapper.rendering  # of the running stage: views may outlive this one
-            if rendering is not None:
-                rendering.prefetch(self._context.images.key(view))
+            if rendering is not None and rendering.prefetches:
+                rendering.prefetch(self._context.images.key(next_view()))
 
         return PrefetchingViews([self._view(key) for key in self.train], prefetch)
 

@@ -43,6 +43,11 @@ class UpsampledImages:
         self.store.put(name, image)
         self._sizes[name] = size
 
+    @property
+    def where(self) -> str:
+        """Where the images wait, as `ImageStore.where`."""
+        return self.store.where
+
     def prefetch(self, name: str) -> None:
         """Start copying a view's stored image to the device; see `ImageStore.prefetch`."""
         self.store.prefetch(name)

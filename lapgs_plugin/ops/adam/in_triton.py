@@ -1,4 +1,4 @@
-"""Take one Adam step of all tensors of a field in one kernel.
+"""Take one Adam step of a tensor, or of all tensors of a field, in one kernel.
 
 PyTorch's fused Adam launches a kernel for each tensor and has one learning rate for it. With it, SH have to be two
 tensors, which are concatenated for every render and split in every backward pass.
@@ -17,7 +17,6 @@ from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 from lapgs_plugin.ops.launch import blocks, launch
 
 BLOCK = 512
-EPS = tl.constexpr(ADAM_EPS)
 COLUMNS = tuple(f"columns{i}" for i in range(5))
 
 
@@ -25,7 +24,7 @@ COLUMNS = tuple(f"columns{i}" for i in range(5))
 def _move(
     values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor,
     rate: float, rest: float, unbias: float, scale: float, keep1: float, take1: float, keep2: float, take2: float,
-    n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
+    eps: float, n: tl.tensor, columns: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Step `block` rows of one tensor, `columns` contiguous numbers each.
 
@@ -43,7 +42,7 @@ def _move(
         size = rate
         if columns > 4:
             size = tl.where(places % columns < 3, rate, rest)
-        moved = tl.load(values + places, here, 0.0) - size * mean / (tl.sqrt(square) * unbias + EPS)
+        moved = tl.load(values + places, here, 0.0) - size * mean / (tl.sqrt(square) * unbias + eps)
         tl.store(means + places, mean, here)
         tl.store(squares + places, square, here)
         tl.store(values + places, moved, here)
@@ -61,15 +60,49 @@ def _kernel(
     rate3: float, rest3: float, unbias3: float,
     values4: tl.tensor, gradients4: tl.tensor, means4: tl.tensor, squares4: tl.tensor,
     rate4: float, rest4: float, unbias4: float,
-    scale: float, k1: float, t1: float, k2: float, t2: float, n: int,
+    scale: float, k1: float, t1: float, k2: float, t2: float, eps: float, n: int,
     columns0: tl.constexpr, columns1: tl.constexpr, columns2: tl.constexpr, columns3: tl.constexpr,
     columns4: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
-    _move(values0, gradients0, means0, squares0, rate0, rest0, unbias0, scale, k1, t1, k2, t2, n, columns0, block)
-    _move(values1, gradients1, means1, squares1, rate1, rest1, unbias1, scale, k1, t1, k2, t2, n, columns1, block)
-    _move(values2, gradients2, means2, squares2, rate2, rest2, unbias2, scale, k1, t1, k2, t2, n, columns2, block)
-    _move(values3, gradients3, means3, squares3, rate3, rest3, unbias3, scale, k1, t1, k2, t2, n, columns3, block)
-    _move(values4, gradients4, means4, squares4, rate4, rest4, unbias4, scale, k1, t1, k2, t2, n, columns4, block)
+    _move(values0, gradients0, means0, squares0, rate0, rest0, unbias0, scale, k1, t1, k2, t2, eps, n, columns0, block)
+    _move(values1, gradients1, means1, squares1, rate1, rest1, unbias1, scale, k1, t1, k2, t2, eps, n, columns1, block)
+    _move(values2, gradients2, means2, squares2, rate2, rest2, unbias2, scale, k1, t1, k2, t2, eps, n, columns2, block)
+    _move(values3, gradients3, means3, squares3, rate3, rest3, unbias3, scale, k1, t1, k2, t2, eps, n, columns3, block)
+    _move(values4, gradients4, means4, squares4, rate4, rest4, unbias4, scale, k1, t1, k2, t2, eps, n, columns4, block)
+
+
+@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+def _tensor_kernel(
+    values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor, rate: float, unbias: float,
+    keep1: float, take1: float, keep2: float, take2: float, eps: float, n: int, block: tl.constexpr,
+) -> None:  # fmt: skip
+    _move(values, gradients, means, squares, rate, rate, unbias, 1.0, keep1, take1, keep2, take2, eps, n, 1, block)
+
+
+def step_tensor_triton(
+    values: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rate: float,
+    unbias: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """Step a float32 tensor on a CUDA device in place.
+
+    Args:
+        values, gradient, mean, square: of one shape, contiguous; the moments are updated, too.
+        rate: step size over the first moment's bias correction.
+        unbias: one over the root of the second moment's bias correction.
+        beta1, beta2, eps: Adam's.
+    """
+    n = values.numel()
+    launch(
+        _tensor_kernel, (blocks(n, BLOCK),), values, gradient, mean, square, rate, unbias,
+        *(beta1, 1 - beta1, beta2, 1 - beta2, eps, n), block=BLOCK,
+    )  # fmt: skip
 
 
 def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
@@ -80,6 +113,6 @@ def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
     for slot in slots:
         unbias1, unbias2 = (1 / (1 - beta**slot.step) for beta in BETAS)
         given += *slot[:4], slot.rate * unbias1, slot.rest * unbias1, math.sqrt(unbias2)
-    given += gradient, keep1, 1 - keep1, keep2, 1 - keep2, n
+    given += gradient, keep1, 1 - keep1, keep2, 1 - keep2, ADAM_EPS, n
     columns = {name: slot.values.numel() // n for name, slot in zip(COLUMNS, slots, strict=True)}
     launch(_kernel, (blocks(n, BLOCK),), *given, **columns, block=BLOCK)

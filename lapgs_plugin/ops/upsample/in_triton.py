@@ -99,16 +99,16 @@ class _Taps(NamedTuple):
 def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False) -> Tensor:
     """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
     size = fine.shape[-2], fine.shape[-1]
-    if clamped:
-        image, (rows, columns) = torch.empty_like(fine), (_up(pyramid.grid, side, fine.device) for side in size)
-        _filter(coarse, rows, columns, image, fine, clamps=True)
-        return image
+    if clamped or not (torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad)):
+        return _upsampled(pyramid.grid, size, coarse, fine, clamps=clamped)
     out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """Do `upsample` for a float32 image on a CUDA device, with any strides."""
+    if not (torch.is_grad_enabled() and coarse.requires_grad):
+        return _upsampled(pyramid.grid, size, coarse)
     out: Tensor = _Upsampled.apply(coarse, None, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
 
@@ -119,10 +119,7 @@ class _Upsampled(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, coarse: Tensor, fine: Tensor | None, grid: str, size: tuple[int, int]) -> Tensor:
         ctx.grid, ctx.size, ctx.shape = grid, size, coarse.shape
-        out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
-        rows, columns = (_up(grid, side, coarse.device) for side in size)
-        _filter(coarse, rows, columns, out, fine)
-        return out
+        return _upsampled(grid, size, coarse, fine)
 
     @staticmethod
     @once_differentiable
@@ -134,6 +131,16 @@ class _Upsampled(torch.autograd.Function):
         rows, columns = (_up_transposed(ctx.grid, side, gradient.device) for side in ctx.size)
         _filter(gradient, rows, columns, out)
         return out, by_fine, None, None
+
+
+def _upsampled(
+    grid: str, size: tuple[int, int], coarse: Tensor, fine: Tensor | None = None, *, clamps: bool = False
+) -> Tensor:
+    """Return Up(coarse) + fine of this size, without a gradient."""
+    out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
+    rows, columns = (_up(grid, side, coarse.device) for side in size)
+    _filter(coarse, rows, columns, out, fine, clamps=clamps)
+    return out
 
 
 def _filter(

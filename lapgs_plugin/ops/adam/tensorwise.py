@@ -1,0 +1,98 @@
+"""Step the tensors of a script's own `torch.optim.Adam` in one of our kernels each.
+
+PyTorch's fused Adam has such kernels, too. But one of its blocks takes 65,536 numbers, so that the positions of 200,000
+Gaussians keep a tenth of a GPU busy, and its Python takes as long as a small render.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.ops.self_check import largest, matches_reference
+
+
+class TensorwiseAdam(torch.optim.Adam):
+    """Step as `torch.optim.Adam` does, with its groups, state and hooks; results differ by rounding.
+
+    `fuse_steps` makes optimizers of this class. It has only what `torch.optim.Adam` has without options.
+    """
+
+    @torch.optim.Optimizer.profile_hook_step
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Step all tensors that have a gradient; return what `closure`, which is called first, returns."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for values in group["params"]:
+                if values.grad is not None:
+                    _step(values, values.grad, self.state[values], group)
+        return loss
+
+    step.hooked = True  # type: ignore[attr-defined]  # as PyTorch marks it, which else calls hooks twice
+
+
+def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
+    """Step a tensor in place."""
+    if not state:  # on the processor, as PyTorch's own counts: a GPU does not have to be asked for it
+        state["step"] = torch.tensor(0.0)
+        state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
+    state["step"] += 1
+    mean, square, count = state["exp_avg"], state["exp_avg_sq"], float(state["step"])
+    beta1, beta2 = group["betas"]
+    # Some scripts set rates of NumPy's types.
+    rate, root = float(group["lr"]) / (1 - beta1**count), math.sqrt(1 - beta2**count)
+    tensors = values, gradient, mean, square
+    if values.numel() > 0 and all(tensor.is_contiguous() for tensor in tensors) and triton_works(*tensors):
+        from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
+
+        step_tensor_triton(*tensors, rate, 1 / root, beta1, beta2, group["eps"])
+        return
+    mean.lerp_(gradient, 1 - beta1)
+    square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    values.addcdiv_(mean, square.sqrt().div_(root).add_(group["eps"]), value=-rate)
+
+
+def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
+    """Let a plain Adam on a CUDA device step each tensor in one kernel instead of a dozen; leave others as they are."""
+    if type(optimizer) is not torch.optim.Adam or not all(map(_is_plain, optimizer.param_groups)):
+        return
+    ours = triton_works()
+    for group in optimizer.param_groups:
+        group["fused"], group["foreach"] = not ours, False
+        for parameter in group["params"]:
+            if "step" in (state := optimizer.state.get(parameter, {})):
+                state["step"] = torch.as_tensor(state["step"]).to("cpu" if ours else parameter.device)
+    if ours:
+        optimizer.__class__ = TensorwiseAdam
+
+
+def _is_plain(group: dict[str, Any]) -> bool:
+    """Return whether a group has none of the options that change what Adam computes."""
+    changes = "amsgrad", "maximize", "weight_decay", "capturable", "differentiable"
+    return not any(group.get(name) for name in changes) and not isinstance(group["lr"], Tensor)
+
+
+@matches_reference("PyTorch's fused Adam instead of ours", 1e-5)
+def triton_works(device: torch.device) -> float:
+    """Compare three steps of more numbers than a program takes, relative to how far they moved."""
+    from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
+
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(700, 3, generator=generator).to(device)
+    reference = torch.nn.Parameter(start.clone())
+    adam = torch.optim.Adam([reference], lr=0.1, eps=1e-15)
+    values, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+    for count in range(1, 4):
+        reference.grad = torch.randn(start.shape, generator=generator).to(device)
+        adam.step()
+        rate, unbias = 0.1 / (1 - 0.9**count), 1 / math.sqrt(1 - 0.999**count)
+        step_tensor_triton(values, reference.grad, mean, square, rate, unbias, 0.9, 0.999, 1e-15)
+    return largest([(values - reference).abs() / (reference.detach() - start).abs().max()])

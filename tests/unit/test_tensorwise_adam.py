@@ -1,0 +1,151 @@
+"""A script's plain Adam, stepped by our kernel, against PyTorch's own."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.ops.adam import tensorwise
+from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam, fuse_steps
+
+DEVICES = ["cpu", pytest.param("cuda", marks=[
+    pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+])]  # fmt: skip
+
+
+@pytest.fixture
+def works(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the kernel pass its check without a GPU; tensors on a CPU are stepped in PyTorch's operations anyway."""
+    if not torch.cuda.is_available():
+        monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
+
+
+def made(device: str, **options: Any) -> tuple[list[torch.nn.Parameter], torch.optim.Adam]:
+    """Return parameters as a 3DGS model has them, and its optimizer."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = (700, 3), (700, 1, 3), (700, 15, 3), (700, 1), (0, 3)
+    tensors = [torch.randn(shape, generator=generator).to(device) for shape in shapes]
+    tensors.append(torch.randn(3, 700, generator=generator).to(device).T)  # not contiguous
+    parameters = [torch.nn.Parameter(tensor) for tensor in tensors]
+    groups = [{"params": [one], "lr": 0.1 * (place + 1), "name": str(place)} for place, one in enumerate(parameters)]
+    return parameters, torch.optim.Adam(groups, lr=0.0, eps=1e-15, **options)
+
+
+def step(parameters: list[torch.nn.Parameter], optimizer: torch.optim.Optimizer, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for place, one in enumerate(parameters):
+        gradient = torch.randn(one.shape, generator=generator).to(one.device)
+        # Of the parameter's strides, as autograd makes it.
+        one.grad = None if (place, seed) == (1, 1) else torch.empty_like(one).copy_(gradient)
+    optimizer.param_groups[0]["lr"] = np.float64(0.1 / (1 + seed))  # as 3DGS's schedule of positions
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+
+
+def assert_same(found: list[torch.nn.Parameter], expected: list[torch.nn.Parameter]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)  # numbers to 5, moved by 1; worst seen 5e-7
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("betas", [(0.9, 0.999), (0.5, 0.9)])
+def test_steps_are_those_of_pytorch(device: str, betas: tuple[float, float], works: None) -> None:
+    (found, ours), (expected, theirs) = made(device, betas=betas), made(device, betas=betas)
+    step(found, ours, 0), step(expected, theirs, 0)  # so that there is state to take over
+    fuse_steps(ours)
+    assert type(ours) is TensorwiseAdam
+    for seed in range(1, 5):
+        step(found, ours, seed)
+        step(expected, theirs, seed)
+    assert_same(found, expected)
+    assert [int(ours.state[one]["step"]) for one in found] == [5, 4, 5, 5, 5, 5], "one had no gradient once"
+
+    # A checkout's own checkpoint, read by a script without us, and back.
+    other, plain = made(device, betas=betas)
+    other = [one.requires_grad_() for one in other]
+    with torch.no_grad():
+        for one, trained in zip(other, found, strict=True):
+            one.copy_(trained)
+    plain.load_state_dict(copy.deepcopy(ours.state_dict()))
+    step(found, ours, 5), step(other, plain, 5), step(expected, theirs, 5)
+    assert_same(found, expected)
+    assert_same(other, expected)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_an_optimizer_fused_by_its_script(device: str, works: None) -> None:
+    (found, ours), (expected, theirs) = made(device, fused=True), made(device)
+    for seed in range(3):
+        step(found, ours, seed)
+        step(expected, theirs, seed)
+        fuse_steps(ours)
+    assert ours.state[found[0]]["step"].device.type == "cpu"
+    assert_same(found, expected)
+
+
+def test_hooks_and_closures_are_called_once(works: None) -> None:
+    parameters, optimizer = made("cpu")
+    fuse_steps(optimizer)
+    called: list[str] = []
+    optimizer.register_step_pre_hook(lambda *_: called.append("before"))
+    optimizer.register_step_post_hook(lambda *_: called.append("after"))
+
+    def closure() -> Tensor:
+        called.append("closure")
+        optimizer.zero_grad()
+        loss = parameters[0].square().sum()
+        loss.backward()
+        return loss
+
+    before = parameters[0].detach().square().sum()
+    assert optimizer.step(closure) == before
+    assert called == ["before", "closure", "after"]
+    restored: torch.optim.Optimizer = copy.deepcopy(optimizer)
+    restored.step()
+    assert called == ["before", "closure", "after"], "hooks are not copied, as of any optimizer"
+    optimizer.step()
+    assert called == ["before", "closure", "after", "before", "after"]
+
+
+class Own(torch.optim.Adam):
+    """A fork's own optimizer."""
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda values: Own([values]),
+        lambda values: torch.optim.SGD([values], lr=0.1),
+        lambda values: torch.optim.AdamW([values]),
+        *(
+            lambda values, name=name: torch.optim.Adam([values], **{name: True})
+            for name in ("amsgrad", "maximize", "differentiable")
+        ),
+        lambda values: torch.optim.Adam([values], weight_decay=0.1),
+        lambda values: torch.optim.Adam([values], lr=torch.tensor(0.1), foreach=False),
+    ],
+)
+def test_what_is_left_alone(make: Callable[[Tensor], torch.optim.Optimizer], works: None) -> None:
+    optimizer = make(torch.nn.Parameter(torch.ones(3)))
+    group, kind = dict(optimizer.param_groups[0]), type(optimizer)
+    fuse_steps(optimizer)
+    assert type(optimizer) is kind
+    assert all(optimizer.param_groups[0][name] is value for name, value in group.items())
+
+
+def test_without_the_kernel_it_is_pytorchs_fused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: False)
+    (found, ours), (expected, theirs) = made("cpu"), made("cpu")
+    for seed in range(3):
+        step(found, ours, seed)
+        step(expected, theirs, seed)
+        fuse_steps(ours)
+    assert type(ours) is torch.optim.Adam
+    assert ours.param_groups[0]["fused"] is True
+    assert_same(found, expected)
