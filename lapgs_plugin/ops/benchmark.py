@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +25,7 @@ from lapgs_plugin.ops import (
     regularization,
     upsample,
 )
+from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
@@ -89,6 +90,8 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
         "position noise": _noise_versions(ours, gaussians, device),
         "colour transform": _transform_versions(images[0]),
     }
+    if device.type == "cuda":
+        operations["Adam of a checkout"] = _checkout_adam_versions(gaussians, device)
     return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
 
 
@@ -186,13 +189,7 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     starts, gradients = (
         [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
     )
-
-    def version(make: Callable[[list[torch.nn.Parameter]], Callable[[], object]]) -> Version:
-        """Give an optimizer its own copy of the parameters."""
-        parameters = [torch.nn.Parameter(start.clone()) for start in starts]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        return Version(make(parameters), parameters[-1])
+    version = partial(_optimizer_version, starts, gradients)
 
     def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
         count = itertools.count(1)
@@ -220,6 +217,44 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
     elif adam.triton_works():
         versions[ours] = version(triton)
     return versions
+
+
+def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
+    """Return versions of the optimizer that 3DGS's scripts make, whose SH are two tensors."""
+    generator = torch.Generator().manual_seed(0)
+    shapes: list[tuple[int, ...]] = [(3,), (1, 3), (15, 3), (1,), (3,), (4,)]
+    starts, gradients = (
+        [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
+    )
+
+    def made(parameters: list[torch.nn.Parameter], fused: bool | None = None) -> torch.optim.Adam:
+        return torch.optim.Adam([{"params": [one]} for one in parameters], 1e-3, eps=adam.ADAM_EPS, fused=fused)
+
+    def ours(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
+        optimizer = made(parameters)
+        tensorwise.fuse_steps(optimizer)
+        return optimizer.step
+
+    version = partial(_optimizer_version, starts, gradients)
+    versions = {
+        TORCH: version(lambda parameters: made(parameters).step),
+        "its fused Adam": version(lambda parameters: made(parameters, fused=True).step),
+    }
+    if tensorwise.triton_works():
+        versions["Triton"] = version(ours)
+    return versions
+
+
+def _optimizer_version(
+    starts: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    make: Callable[[list[torch.nn.Parameter]], Callable[[], object]],
+) -> Version:
+    """Return a version that steps its own copy of the parameters."""
+    parameters = [torch.nn.Parameter(start.clone()) for start in starts]
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    return Version(make(parameters), parameters[-1])
 
 
 def _with_triton(

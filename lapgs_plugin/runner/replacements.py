@@ -11,6 +11,7 @@ from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runner import checkout_ssim
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
@@ -55,6 +56,7 @@ class StageReplacements:
             *self._in_model(profile),
             *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
+            *self._in_losses(profile),
             *parts.replacements(profile, adapter.info),
         ]
 
@@ -98,6 +100,12 @@ class StageReplacements:
         consumer = "training() when it densifies and prunes"
         found = profile.named(names) if hooks else []
         return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in found]
+
+    def _in_losses(self, profile: Profile) -> list[Replacement]:
+        if not self._context.options.fused_ssim:
+            return []
+        found = [place for place in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*place))]
+        return [Replacement(*place, checkout_ssim.in_our_kernels, "training() in its loss") for place in found]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)

@@ -36,6 +36,12 @@ class RunSettings(HierarchySettings):
         panel=STORAGE,
         names=("--fused-adam/--no-fused-adam",),
     )
+    fused_ssim: bool = option(
+        True,
+        "Compute the checkout's SSIM in our kernels, where its function returns the same.",
+        panel=STORAGE,
+        names=("--fused-ssim/--no-fused-ssim",),
+    )
 
     dry_run: bool = option(
         True,
