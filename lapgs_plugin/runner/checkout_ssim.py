@@ -43,8 +43,6 @@ def in_our_kernels(original: Callable[..., Any]) -> Callable[..., Any]:
         device = images[0].device
         if device not in agrees:
             agrees[device] = _agrees(original, device)
-            if agrees[device]:
-                logger.info("%s.%s runs in our kernels", original.__module__, original.__qualname__)
         return _our_ssim(*images) if agrees[device] else original(*args, **kwargs)
 
     return ssim
