@@ -27,6 +27,7 @@ class MeasuringOptions:
     )
     gpu_busy: bool = option(
         False,
-        "Estimate the seconds that the GPU executes kernels, from profiles of some iterations of each stage.",
+        "Estimate the seconds that the GPU executes kernels, from profiles of some iterations of each stage. Makes later "
+        "iterations slower where the GPU waits for launches: take times from a run without it.",
         panel=PANEL,
     )
