@@ -113,6 +113,17 @@ def test_hooks_and_closures_are_called_once(works: None) -> None:
     assert called == ["before", "closure", "after", "before", "after"]
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_moments_of_other_gaussians_are_an_error(device: str, works: None) -> None:
+    parameters, optimizer = made(device)
+    fuse_steps(optimizer)
+    step(parameters, optimizer, 0)
+    state = optimizer.state[parameters[0]]
+    state["exp_avg"] = state["exp_avg"][:600]
+    with pytest.raises(RuntimeError, match="size"):
+        step(parameters, optimizer, 1)
+
+
 class Own(torch.optim.Adam):
     """A fork's own optimizer."""
 

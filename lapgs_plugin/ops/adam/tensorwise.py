@@ -50,7 +50,9 @@ def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[s
     # Some scripts set rates of NumPy's types.
     rate, root = float(group["lr"]) / (1 - beta1**count), math.sqrt(1 - beta2**count)
     tensors = values, gradient, mean, square
-    if values.numel() > 0 and all(tensor.is_contiguous() for tensor in tensors) and triton_works(*tensors):
+    # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
+    alike = all(tensor.is_contiguous() and tensor.shape == values.shape for tensor in tensors)
+    if alike and values.numel() > 0 and triton_works(*tensors):
         from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
 
         step_tensor_triton(*tensors, rate, 1 / root, beta1, beta2, group["eps"])
