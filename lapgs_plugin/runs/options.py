@@ -27,7 +27,7 @@ class MeasuringOptions:
     )
     gpu_busy: bool = option(
         False,
-        "Estimate the seconds that the GPU executes kernels, from profiles of some iterations of each stage. Makes later "
-        "iterations slower where the GPU waits for launches: take times from a run without it.",
+        "Estimate the seconds that the GPU executes kernels, from profiles of some iterations of each stage. They slow "
+        "the iterations after them where the GPU waits for launches: take times from a run without this.",
         panel=PANEL,
     )
