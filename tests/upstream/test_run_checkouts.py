@@ -28,11 +28,16 @@ OPTIONS = {
 VARIABLES = tuple(OPTIONS)
 
 NOT_CALLED = {
-    "LAPGS_FASTGS": {"final_prune_fastgs"},  # from 18,000 iterations on
-    "LAPGS_TAMING": {"densify_and_clone", "densify_and_prune", "densify_and_split"},  # it has its own beside 3DGS's
-    "LAPGS_GRAPHDECO": set[str](),
+    "LAPGS_FASTGS": {"final_prune_fastgs", "ssim"},  # from 18,000 iterations on
+    "LAPGS_TAMING": {
+        "densify_and_clone",
+        "densify_and_prune",
+        "densify_and_split",
+        "ssim",
+    },  # it has its own beside 3DGS's
+    "LAPGS_GRAPHDECO": {"ssim"},
 }
-"""Methods for density control that a checkout does not call in so few iterations, or never."""
+"""What a checkout does not call in so few iterations, or never; these have SSIM from `fused_ssim`."""
 
 
 def arguments_of(variable: str, scene: Path) -> list[str]:
