@@ -4,16 +4,52 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from lapgs_plugin.ops.adam import tensorwise
+from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
 from lapgs_plugin.runner import checkout_ssim
-from tests.contract.stub_runs import FORKS, SHORT, composed_psnr, run_hierarchy
+from lapgs_plugin.runner.stage_model import StageModel
+from tests.contract.stub_runs import FORKS, KINDS, SHORT, STUBS, STUBS_AND_KINDS, composed_psnr, run_hierarchy
 
 
-@pytest.mark.parametrize("kind", ["nested", "laplacian"])
+def seed_all() -> None:
+    for seed in (random.seed, np.random.seed, torch.manual_seed):
+        seed(0)
+
+
+@pytest.mark.parametrize(("name", "kind"), STUBS_AND_KINDS)
+def test_adam(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its class on a CPU, where it steps in PyTorch's operations: density control edits its state as PyTorch's."""
+    seed_all()
+    plain, _ = run_hierarchy(STUBS[name], scene, tmp_path / "plain", hierarchy=kind)
+    used: set[type] = set()
+    prepare, step = StageModel.prepare_optimizers, TensorwiseAdam.step
+
+    def prepare_and_fuse(model: StageModel, gaussians: Any, inherit: bool) -> None:
+        prepare(model, gaussians, inherit)
+        for optimizer in model._adapter.optimizers(gaussians):
+            tensorwise.fuse_steps(optimizer)
+
+    def counted(optimizer: TensorwiseAdam, *args: Any) -> Any:
+        used.add(type(optimizer))
+        return step(optimizer, *args)
+
+    counted.hooked = True  # type: ignore[attr-defined]
+    monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
+    monkeypatch.setattr(StageModel, "prepare_optimizers", prepare_and_fuse)
+    monkeypatch.setattr(TensorwiseAdam, "step", counted)
+    seed_all()
+    ours, _ = run_hierarchy(STUBS[name], scene, tmp_path / "ours", hierarchy=kind)
+    assert used == {TensorwiseAdam}
+    assert composed_psnr(ours) == pytest.approx(composed_psnr(plain), abs=0.2)  # dB; worst seen 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[torch.Size] = []
     ours = checkout_ssim._our_ssim
@@ -25,8 +61,7 @@ def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.Monkey
     monkeypatch.setattr(checkout_ssim, "_our_ssim", counted)
     found = []
     for on in (True, False):
-        for seed in (random.seed, np.random.seed, torch.manual_seed):
-            seed(0)
+        seed_all()
         called.clear()
         archive, _ = run_hierarchy(
             FORKS["dash"], scene, tmp_path / str(on), *SHORT, hierarchy=kind, fused_ssim=on, joint=0.0
