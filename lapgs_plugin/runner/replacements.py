@@ -10,6 +10,7 @@ from typing import Any
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
+from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_ssim
 from lapgs_plugin.runner.active_stage import ActiveStage
@@ -46,6 +47,7 @@ class StageReplacements:
         adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
         require_matching_rasterizer(profile, adapter.info.title)
         return [
+            writing_whole_files(),
             *self._in_training(profile),
             *(
                 Replacement(camera, "__init__", self._context.images.adopting, "the scene's loader, for every image")
