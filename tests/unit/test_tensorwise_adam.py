@@ -86,6 +86,7 @@ def test_an_optimizer_fused_by_its_script(device: str, works: None) -> None:
         step(expected, theirs, seed)
         fuse_steps(ours)
     assert ours.state[found[0]]["step"].device.type == "cpu"
+    assert [ours.param_groups[0][name] for name in ("fused", "foreach")] == [None, None], "PyTorch's defaults"
     assert_same(found, expected)
 
 

@@ -68,7 +68,10 @@ def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
         return
     ours = triton_works()
     for group in optimizer.param_groups:
-        group["fused"], group["foreach"] = not ours, False
+        if ours:  # as PyTorch's default has it, because a checkpoint tells the next optimizer what it was
+            group["fused"] = None
+        else:
+            group["fused"], group["foreach"] = True, False
         for parameter in group["params"]:
             if "step" in (state := optimizer.state.get(parameter, {})):
                 state["step"] = torch.as_tensor(state["step"]).to("cpu" if ours else parameter.device)
