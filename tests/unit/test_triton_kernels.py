@@ -138,7 +138,7 @@ from lapgs_plugin.ops.adam import tensorwise
 torch.set_default_device(None)
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
-assert tensorwise.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 4e-7
+assert tensorwise.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 8e-7
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 1e-5
 assert position_noise.triton_works.difference(torch.device(DEVICE)) < 1e-5

@@ -79,30 +79,18 @@ def _tensor_kernel(
     _move(values, gradients, means, squares, rate, rate, unbias, 1.0, keep1, take1, keep2, take2, eps, n, 1, block)
 
 
-def step_tensor_triton(
-    values: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rate: float,
-    unbias: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-) -> None:
-    """Step a float32 tensor on a CUDA device in place.
+def step_tensor_triton(slot: AdamSlot, betas: tuple[float, float], eps: float) -> None:
+    """Do `step_torch` for one float32 tensor, all of whose columns have one rate, on a CUDA device."""
+    n, (keep1, keep2) = slot.values.numel(), betas
+    unbias1, unbias2 = _unbiased(slot.step, betas)
+    numbers = slot.rate * unbias1, unbias2, keep1, 1 - keep1, keep2, 1 - keep2, eps, n
+    launch(_tensor_kernel, (blocks(n, BLOCK),), *slot[:4], *numbers, block=BLOCK)
 
-    Args:
-        values, gradient, mean, square: of one shape, contiguous; the moments are updated, too.
-        rate: step size over the first moment's bias correction.
-        unbias: one over the root of the second moment's bias correction.
-        beta1, beta2, eps: Adam's.
-    """
-    n = values.numel()
-    launch(
-        _tensor_kernel, (blocks(n, BLOCK),), values, gradient, mean, square, rate, unbias,
-        *(beta1, 1 - beta1, beta2, 1 - beta2, eps, n), block=BLOCK,
-    )  # fmt: skip
+
+def _unbiased(step: float, betas: tuple[float, float]) -> tuple[float, float]:
+    """Return the factors by which rates have the first moment's bias correction, and roots the second's."""
+    first, second = (1 / (1 - beta**step) for beta in betas)
+    return first, math.sqrt(second)
 
 
 def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
@@ -111,8 +99,8 @@ def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
     keep1, keep2 = (beta**views for beta in BETAS)
     given: list[Tensor | float] = []
     for slot in slots:
-        unbias1, unbias2 = (1 / (1 - beta**slot.step) for beta in BETAS)
-        given += *slot[:4], slot.rate * unbias1, slot.rest * unbias1, math.sqrt(unbias2)
+        unbias1, unbias2 = _unbiased(slot.step, BETAS)
+        given += *slot[:4], slot.rate * unbias1, slot.rest * unbias1, unbias2
     given += gradient, keep1, 1 - keep1, keep2, 1 - keep2, ADAM_EPS, n
     columns = {name: slot.values.numel() // n for name, slot in zip(COLUMNS, slots, strict=True)}
     launch(_kernel, (blocks(n, BLOCK),), *given, **columns, block=BLOCK)

@@ -6,13 +6,14 @@ Gaussians keep a tenth of a GPU busy, and its Python takes as long as a small re
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
+from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
@@ -44,22 +45,21 @@ def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[s
     if not state:  # on the processor, as PyTorch's own counts: a GPU does not have to be asked for it
         state["step"] = torch.tensor(0.0)
         state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
-    state["step"] += 1
-    mean, square, count = state["exp_avg"], state["exp_avg_sq"], float(state["step"])
-    beta1, beta2 = group["betas"]
-    # Some scripts set rates of NumPy's types.
-    rate, root = float(group["lr"]) / (1 - beta1**count), math.sqrt(1 - beta2**count)
+    rate = float(group["lr"])  # some scripts set rates of NumPy's types
+    betas, eps, mean, square = group["betas"], group["eps"], state["exp_avg"], state["exp_avg_sq"]
     tensors = values, gradient, mean, square
     # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
     alike = all(tensor.is_contiguous() and tensor.shape == values.shape for tensor in tensors)
     if alike and values.numel() > 0 and triton_works(*tensors):
         from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
 
-        step_tensor_triton(*tensors, rate, 1 / root, beta1, beta2, group["eps"])
+        state["step"] += 1
+        step_tensor_triton(AdamSlot(*tensors, float(state["step"]), rate, rate), betas, eps)
         return
-    mean.lerp_(gradient, 1 - beta1)
-    square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-    values.addcdiv_(mean, square.sqrt().div_(root).add_(group["eps"]), value=-rate)
+    adam(
+        [values], [gradient], [mean], [square], [], [state["step"]], foreach=False, amsgrad=False, maximize=False,
+        weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=eps,
+    )  # fmt: skip
 
 
 def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
@@ -93,11 +93,10 @@ def triton_works(device: torch.device) -> float:
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(700, 3, generator=generator).to(device)
     reference = torch.nn.Parameter(start.clone())
-    adam = torch.optim.Adam([reference], lr=0.1, eps=1e-15)
+    optimizer = torch.optim.Adam([reference], lr=0.1, eps=ADAM_EPS)
     values, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
     for count in range(1, 4):
         reference.grad = torch.randn(start.shape, generator=generator).to(device)
-        adam.step()
-        rate, unbias = 0.1 / (1 - 0.9**count), 1 / math.sqrt(1 - 0.999**count)
-        step_tensor_triton(values, reference.grad, mean, square, rate, unbias, 0.9, 0.999, 1e-15)
+        optimizer.step()
+        step_tensor_triton(AdamSlot(values, reference.grad, mean, square, count, 0.1, 0.1), BETAS, ADAM_EPS)
     return largest([(values - reference).abs() / (reference.detach() - start).abs().max()])
