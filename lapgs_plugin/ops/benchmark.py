@@ -184,18 +184,14 @@ def _transform_versions(image: Tensor) -> Versions:
 
 
 def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
-    generator = torch.Generator().manual_seed(0)
-    shapes: list[tuple[int, ...]] = [(3,), (4,), (3,), (), (16, 3)]
-    starts, gradients = (
-        [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
-    )
-    version = partial(_optimizer_version, starts, gradients)
+    version = _stepping([(3,), (4,), (3,), (), (16, 3)], gaussians, device)
 
     def plain(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
         count = itertools.count(1)
         slots = [
-            AdamSlot(one, gradient, torch.zeros_like(one), torch.zeros_like(one), 0, 1e-3, 1e-3)
-            for one, gradient in zip(parameters, gradients, strict=True)
+            AdamSlot(one, one.grad, torch.zeros_like(one), torch.zeros_like(one), 0, 1e-3, 1e-3)
+            for one in parameters
+            if one.grad is not None
         ]
 
         def step() -> None:
@@ -221,11 +217,7 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
 
 def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
     """Return versions of the optimizer that 3DGS's scripts make, whose SH are two tensors."""
-    generator = torch.Generator().manual_seed(0)
-    shapes: list[tuple[int, ...]] = [(3,), (1, 3), (15, 3), (1,), (3,), (4,)]
-    starts, gradients = (
-        [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
-    )
+    version = _stepping([(3,), (1, 3), (15, 3), (1,), (3,), (4,)], gaussians, device)
 
     def made(parameters: list[torch.nn.Parameter], fused: bool | None = None) -> torch.optim.Adam:
         return torch.optim.Adam([{"params": [one]} for one in parameters], 1e-3, eps=adam.ADAM_EPS, fused=fused)
@@ -235,7 +227,6 @@ def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
         tensorwise.fuse_steps(optimizer)
         return optimizer.step
 
-    version = partial(_optimizer_version, starts, gradients)
     versions = {
         TORCH: version(lambda parameters: made(parameters).step),
         "its fused Adam": version(lambda parameters: made(parameters, fused=True).step),
@@ -245,16 +236,23 @@ def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
     return versions
 
 
-def _optimizer_version(
-    starts: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    make: Callable[[list[torch.nn.Parameter]], Callable[[], object]],
-) -> Version:
-    """Return a version that steps its own copy of the parameters."""
-    parameters = [torch.nn.Parameter(start.clone()) for start in starts]
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
-    return Version(make(parameters), parameters[-1])
+def _stepping(
+    shapes: Sequence[tuple[int, ...]], gaussians: int, device: torch.device
+) -> Callable[[Callable[[list[torch.nn.Parameter]], Callable[[], object]]], Version]:
+    """Return what makes a version of a function that returns an optimizer's step for parameters of these shapes."""
+    generator = torch.Generator().manual_seed(0)
+    starts, gradients = (
+        [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)
+    )
+
+    def version(make: Callable[[list[torch.nn.Parameter]], Callable[[], object]]) -> Version:
+        """Give an optimizer its own copy of the parameters."""
+        parameters = [torch.nn.Parameter(start.clone()) for start in starts]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        return Version(make(parameters), parameters[-1])
+
+    return version
 
 
 def _with_triton(

@@ -39,7 +39,7 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
     if clamped:
         return upsample_add(pyramid, coarse, fine).clamp_(0.0, 1.0)
     coarse = coarse.to(fine.dtype)
-    if torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad):
+    if are_differentiated(coarse, fine):
         return upsample(pyramid, coarse, size) + fine
     if _fits_numba(fine):
         from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
@@ -59,7 +59,7 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
         UserInputError: the image is not half of `size`.
     """
     require_half(coarse, size)
-    if _fits_numba(coarse) and not (torch.is_grad_enabled() and coarse.requires_grad):
+    if _fits_numba(coarse) and not are_differentiated(coarse):
         from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
 
         return upsample_cpu(pyramid, coarse, size)
@@ -68,6 +68,11 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     from lapgs_plugin.ops.upsample.in_triton import upsample_triton
 
     return upsample_triton(pyramid, coarse, size)
+
+
+def are_differentiated(*images: Tensor) -> bool:
+    """Return whether gradients by one of the images are recorded."""
+    return torch.is_grad_enabled() and any(image.requires_grad for image in images)
 
 
 def _fits_numba(image: Tensor) -> bool:

@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
 from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
+from lapgs_plugin.ops.upsample import are_differentiated
 
 BLOCK = 128
 LEAST_ROWS = 8
@@ -99,7 +100,7 @@ class _Taps(NamedTuple):
 def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False) -> Tensor:
     """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
     size = fine.shape[-2], fine.shape[-1]
-    if clamped or not (torch.is_grad_enabled() and (coarse.requires_grad or fine.requires_grad)):
+    if clamped or not are_differentiated(coarse, fine):
         return _upsampled(pyramid.grid, size, coarse, fine, clamps=clamped)
     out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
@@ -107,7 +108,7 @@ def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped:
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     """Do `upsample` for a float32 image on a CUDA device, with any strides."""
-    if not (torch.is_grad_enabled() and coarse.requires_grad):
+    if not are_differentiated(coarse):
         return _upsampled(pyramid.grid, size, coarse)
     out: Tensor = _Upsampled.apply(coarse, None, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
     return out
