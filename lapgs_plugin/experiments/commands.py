@@ -26,7 +26,7 @@ SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
-ON_BY_DEFAULT = ("dry-run", "fused-adam", "fused-ssim", "prune-by-size")
+ON_BY_DEFAULT = ("dry-run", "fused-adam", "fused-ssim", "prune-by-size", "run-ahead")
 """Options that --no-NAME switches off."""
 RASTER_OPTIONS = ("mult", "antialiasing")
 """Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""

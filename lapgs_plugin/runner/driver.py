@@ -39,6 +39,7 @@ from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
 from lapgs_plugin.runner.dry_run import DryRun
+from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
@@ -95,7 +96,7 @@ class HierarchyDriver:
             options=options,
             device=place,
             images=SceneImages(),
-            wrapper=RasterizerWrapper(parts.mark_render),
+            wrapper=RasterizerWrapper(parts.mark_render, EarlyVisibility() if options.run_ahead else None),
             hooks=HookCaller(hooks),
             parts=parts,
             watcher=watcher or Watcher(),

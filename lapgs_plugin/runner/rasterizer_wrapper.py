@@ -21,6 +21,7 @@ from torch import Tensor
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
+from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.signed_calls import signed_settings
 from lapgs_plugin.runner.stage_rendering import StageRendering
 
@@ -49,14 +50,17 @@ class RasterizerWrapper:
 
     Args:
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
+        visibility: finds visible Gaussians early; None leaves it to the renderers.
 
     Attributes:
         rendering: how the running stage is rendered; None leaves every call unchanged.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
 
-    def __init__(self, mark: Callable[[str], None] = lambda part: None) -> None:
-        self._mark = mark
+    def __init__(
+        self, mark: Callable[[str], None] = lambda part: None, visibility: EarlyVisibility | None = None
+    ) -> None:
+        self._mark, self._visibility = mark, visibility
         self.rendering: StageRendering | None = None
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
@@ -66,6 +70,7 @@ class RasterizerWrapper:
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
+        made = original if self._visibility is None else self._visibility.applied(original)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
@@ -79,7 +84,7 @@ class RasterizerWrapper:
                 place = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
             self.running = _RendererCall(way, key, place, (*outer.given, *values))
             try:
-                return original(*args, **kwargs)
+                return made(*args, **kwargs)
             finally:
                 self.running = outer
 
@@ -141,6 +146,8 @@ class RasterizerWrapper:
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
             def marked(**inputs: Any) -> Any:
                 outputs = rasterizer(**inputs)
+                if self._visibility is not None:
+                    self._visibility.note(outputs)
                 self._mark("loss")
                 return outputs
 

@@ -16,6 +16,7 @@ from lapgs_plugin.runner import checkout_ssim
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import RunContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
+from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import is_trained, timing_replacements
 
 SIZE_LIMIT = "max_screen_size"
@@ -110,9 +111,11 @@ class StageReplacements:
         return [Replacement(*place, checkout_ssim.in_our_kernels, "training() in its loss") for place in found]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        made = reading_late(original) if self._context.options.run_ahead else original
+
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:
-            self._train(TrainingCall.bind(original, args, kwargs))
+            self._train(TrainingCall.bind(made, args, kwargs))
             return self._context.returned
 
         return training

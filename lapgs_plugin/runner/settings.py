@@ -42,6 +42,13 @@ class RunSettings(HierarchySettings):
         panel=STORAGE,
         names=("--fused-ssim/--no-fused-ssim",),
     )
+    run_ahead: bool = option(
+        True,
+        "Let the checkout's loop go on while the GPU computes what the loop only logs, and blends an image of which it "
+        "asks for the visible Gaussians.",
+        panel=STORAGE,
+        names=("--run-ahead/--no-run-ahead",),
+    )
 
     dry_run: bool = option(
         True,

@@ -1,0 +1,230 @@
+"""Let a training function read the numbers that it only logs when it shows them. Imports no torch, executes nothing.
+
+Loops of the family read their loss in every iteration, `0.4 * loss.item() + 0.6 * ema`, and show it in every tenth. The
+read waits until the GPU has done everything that it was given. So does `torch.cuda.synchronize()` before a time is
+read from events.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterable
+from typing import TypeGuard
+
+from lapgs_plugin.checkouts.syntax import called_names
+
+ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.Div)
+SHOWING = {"format", "add_scalar", "set_postfix"}
+"""Methods that show numbers."""
+HARMLESS = ("no_grad()", "inference_mode()")
+"""Decorators of functions that are followed."""
+CLOCKS = {"time", "time_ns", "perf_counter", "perf_counter_ns", "monotonic", "monotonic_ns", "process_time"}
+"""Functions that read a clock of the processor."""
+
+READ, ELAPSED, ELAPSED_NOW = "_lapgs_read", "_lapgs_elapsed", "_lapgs_elapsed_now"
+"""Names of what takes the place of `x.item()`, and of `a.elapsed_time(b)` late and at once."""
+RECORD, NUMBER = "_lapgs_record", "_lapgs_number"
+"""Names of what takes the place of `a.record()`, and of what waits for a number."""
+
+
+class LateNumbers(ast.NodeTransformer):
+    """Change a training function so that it goes on while the GPU computes numbers that it logs.
+
+    `x.item()` becomes `READ(x)` and `a.elapsed_time(b)` becomes `ELAPSED(a, b)` where the number is added, multiplied,
+    formatted, or given to a function of the script that does the same. They return late numbers, which are waited for
+    when they are formatted; wherever else a variable with such a number is used, it becomes `NUMBER(variable)`.
+
+    Events of late times are made anew by each `a.record()`. `torch.cuda.synchronize()` in a loop is left out unless the
+    loop reads a clock of the processor; other times of events then wait for their end, `ELAPSED_NOW(a, b)`.
+
+    Args:
+        function: the training function, for `visit`, which changes it.
+        script: its module, for functions that are given numbers.
+
+    Attributes:
+        found: number of reads that are late.
+    """
+
+    def __init__(self, function: ast.FunctionDef, script: ast.Module) -> None:
+        functions = {node.name: node for node in script.body if isinstance(node, ast.FunctionDef)}
+        nodes = list(ast.walk(function))
+        uses, events = _Uses(function, functions), _local_events(nodes)
+        self._late: set[ast.AST] = set()
+        self._waited_for: set[ast.AST] = set()
+        for call in nodes:
+            if _is_read(call, events) and (waits := uses.waiting([call])) is not None and call not in waits:
+                self._late.add(call)
+                self._waited_for |= waits
+        self._timed = {name for call in self._late if _method(call) == "elapsed_time" for name in _variables(call)}
+        loops = [node for node in nodes if isinstance(node, (ast.For, ast.While))]
+        inside = [node for loop in loops for node in ast.walk(loop)]
+        self._waits = set() if CLOCKS & _called(inside) else {node for node in inside if _is_wait(node)}
+        self.found = len(self._late)
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        """Return the node, or what takes its place."""
+        made = self._instead_of(node)
+        if node in self._waited_for:
+            assert isinstance(made, ast.expr), "a variable, or what is computed with it"
+            made = _call(NUMBER, made)
+        return made if made is node else ast.fix_missing_locations(ast.copy_location(made, node))
+
+    def _instead_of(self, node: ast.AST) -> ast.AST:
+        self.generic_visit(node)
+        match node:
+            case ast.Expr(value=value) if value in self._waits:
+                return ast.Pass()
+            case ast.Expr(value=ast.Call(func=ast.Attribute(ast.Name(id=event), "record"), args=args)):
+                made = _call(RECORD, ast.Name(event, ast.Load()), *args)
+                return ast.Assign([ast.Name(event, ast.Store())], made) if event in self._timed else node
+            case ast.Call(func=ast.Attribute(value, "item")) if node in self._late:
+                return _call(READ, value)
+            case ast.Call(func=ast.Attribute(value, "elapsed_time"), args=args, keywords=[]):
+                return _call(ELAPSED if node in self._late else ELAPSED_NOW, value, *args)
+        return node
+
+
+class _Uses:
+    """Follow numbers through a function.
+
+    Args:
+        function: the function.
+        others: functions of its script by name.
+        followed: functions and parameters that are being followed.
+    """
+
+    def __init__(
+        self,
+        function: ast.FunctionDef,
+        others: dict[str, ast.FunctionDef],
+        followed: frozenset[tuple[str, str]] = frozenset(),
+    ) -> None:
+        self._nodes, self._others, self._followed = list(ast.walk(function)), others, followed
+        self._parents = {child: node for node in self._nodes for child in ast.iter_child_nodes(node)}
+
+    def waiting(self, numbers: Iterable[ast.expr] = (), names: Iterable[str] = ()) -> set[ast.AST] | None:
+        """Return the expressions by which numbers, or those of variables, get to where they cannot be late.
+
+        None if they get into variables that others see.
+        """
+        shared = {name for node in self._nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
+        known, waiting = set(names), set[ast.AST]()
+        open_numbers = [*numbers, *(each for name in known for each in self._loads(name))]
+        while open_numbers:
+            number = open_numbers.pop()
+            while _computes(self._parents[number], number):
+                number = self._parents[number]  # type: ignore[assignment]  # an expression, as it computes
+            if (name := self._variable(number)) is not None:
+                if name in shared:
+                    return None
+                if name not in known:
+                    known.add(name)
+                    open_numbers += self._loads(name)
+            elif not self._is_shown(number):
+                waiting.add(number)
+        return waiting
+
+    def _loads(self, name: str) -> list[ast.expr]:
+        names = (node for node in self._nodes if isinstance(node, ast.Name) and node.id == name)
+        return [node for node in names if isinstance(node.ctx, ast.Load)]
+
+    def _variable(self, number: ast.expr) -> str | None:
+        """Return the variable that is set to a number or changed by it."""
+        match self._parents[number]:
+            case ast.Assign(targets=[ast.Name(id=name)]):
+                return name
+            case ast.AugAssign(target=ast.Name(id=name), op=operation) if isinstance(operation, ARITHMETIC):
+                return name
+        return None
+
+    def _is_shown(self, number: ast.expr) -> bool:
+        """Return whether a number is formatted, or given to what shows it."""
+        parent = self._parents[number]
+        if isinstance(parent, (ast.FormattedValue, ast.Expr)):
+            return True
+        if isinstance(parent, ast.Dict):
+            call = self._parents[parent]
+            return isinstance(call, ast.Call) and _method(call) == "set_postfix"
+        name = parent.arg if isinstance(parent, ast.keyword) else None
+        call = self._parents[parent] if isinstance(parent, ast.keyword) else parent
+        if not isinstance(call, ast.Call) or number is call.func:
+            return False
+        if isinstance(call.func, ast.Name):
+            return call.func.id == "print" or self._is_shown_by(call, call.func.id, number, name)
+        return _method(call) in SHOWING
+
+    def _is_shown_by(self, call: ast.Call, function: str, number: ast.expr, keyword: str | None) -> bool:
+        """Return whether another function of the script does no more with an argument than show it."""
+        other = self._others.get(function)
+        starred = any(isinstance(each, ast.Starred) for each in call.args)
+        if other is None or starred or not all(ast.unparse(each).endswith(HARMLESS) for each in other.decorator_list):
+            return False
+        places = [each.arg for each in (*other.args.posonlyargs, *other.args.args)]
+        if keyword is None:
+            place = call.args.index(number)
+            keyword = places[place] if place < len(places) else None
+        elif keyword not in (*places, *(each.arg for each in other.args.kwonlyargs)):
+            return False
+        if keyword is None or (function, keyword) in self._followed:
+            return False
+        followed = self._followed | {(function, keyword)}
+        return _Uses(other, self._others, followed).waiting(names=[keyword]) == set()
+
+
+def _computes(parent: ast.AST, node: ast.AST) -> bool:
+    match parent:
+        case ast.IfExp(test=test):
+            return node is not test
+        case ast.UnaryOp(op=ast.USub()):
+            return True
+    return isinstance(parent, ast.BinOp) and isinstance(parent.op, ARITHMETIC)
+
+
+def _is_read(node: ast.AST, events: set[str]) -> TypeGuard[ast.Call]:
+    match node:
+        case ast.Call(func=ast.Attribute(attr="item"), args=[], keywords=[]):
+            return True
+        case ast.Call(func=ast.Attribute(ast.Name(), "elapsed_time"), args=[ast.Name()], keywords=[]):
+            return _variables(node) <= events
+    return False
+
+
+def _variables(call: ast.AST) -> set[str]:
+    """Return the variables of two events of which the time between is asked for."""
+    names = [node for node in ast.walk(call) if isinstance(node, ast.Name)]
+    return {node.id for node in names}
+
+
+def _method(call: ast.AST) -> str:
+    return call.func.attr if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else ""
+
+
+def _called(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the names of functions and methods that are called."""
+    nodes = list(nodes)
+    return {*called_names(nodes), *map(_method, nodes)}
+
+
+def _call(name: str, *arguments: ast.expr) -> ast.Call:
+    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
+
+
+def _local_events(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the variables of a function that it only sets to new events."""
+    nodes = list(nodes)
+    stored = Counter(n.id for n in nodes if isinstance(n, ast.Name) and not isinstance(n.ctx, ast.Load))
+    made = Counter(name for node in nodes if (name := _new_event(node)) is not None)
+    shared = {name for n in nodes if isinstance(n, (ast.Global, ast.Nonlocal)) for name in n.names}
+    return {name for name, count in made.items() if stored[name] == count} - shared
+
+
+def _new_event(node: ast.AST) -> str | None:
+    match node:
+        case ast.Assign(targets=[ast.Name(id=name)], value=ast.Call(func=function)):
+            return name if ast.unparse(function).split(".")[-1] == "Event" else None
+    return None
+
+
+def _is_wait(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and ast.unparse(node) == "torch.cuda.synchronize()"
