@@ -1,0 +1,111 @@
+"""Visible Gaussians found beside blending, against `(radii > 0).nonzero()`."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.runner.early_visibility import EarlyVisibility
+
+DEVICES = ["cpu", pytest.param("cuda", marks=[
+    pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+])]  # fmt: skip
+
+RENDERERS = """
+def render(rasterizer, values, keep=None):
+    image, radii = rasterizer(values)
+    if keep is not None:
+        radii[keep] = 0
+    return {"image": image, "visible": (radii > 0).nonzero(), "radii": radii}
+
+def render_masked(rasterizer, values):
+    image, radii = rasterizer(values)
+    return {"image": image, "visible": radii > 0, "radii": radii}
+"""
+
+
+@pytest.fixture
+def renderers(tmp_path: Path) -> ModuleType:
+    path = tmp_path / "renderers.py"
+    path.write_text(RENDERERS)
+    spec = importlib.util.spec_from_file_location("renderers", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class _Rasterized(torch.autograd.Function):
+    """Count on the processor, then be busy with an image for a long time."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, busy: int, counts: bool) -> tuple[Tensor, Tensor]:
+        radii = values.to(torch.int32)
+        count = int((radii > 0).sum())
+        if counts:
+            ctx.num_rendered = count
+        if busy:
+            torch.cuda._sleep(busy)
+        return values.sum().expand(3, 2, 2).clone(), radii
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, ...]:
+        return None, None, None
+
+
+def rasterize(values: Tensor, busy: int = 0, counts: bool = True) -> Any:
+    return _Rasterized.apply(values, busy, counts)  # type: ignore[no-untyped-call]  # torch's
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("counts", [True, False])
+def test_indices_are_the_same(renderers: ModuleType, device: str, counts: bool) -> None:
+    visibility = EarlyVisibility()
+    render = visibility.applied(renderers.render)
+    values = torch.randn(1000, generator=torch.Generator().manual_seed(0)).mul(3).to(device).requires_grad_()
+
+    def noted(given: Tensor) -> Any:
+        outputs = rasterize(given, counts=counts)
+        visibility.note(outputs)
+        return outputs
+
+    found = render(noted, values)
+    assert torch.equal(found["visible"], (found["radii"] > 0).nonzero())
+    changed = render(noted, values, torch.arange(0, 1000, 2, device=device))
+    assert torch.equal(changed["visible"], (changed["radii"] > 0).nonzero())
+    assert len(changed["visible"]) < len(found["visible"])
+    with torch.inference_mode():
+        assert torch.equal(render(noted, values.detach())["visible"], found["visible"])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_image_is_not_waited_for(renderers: ModuleType) -> None:
+    visibility = EarlyVisibility()
+    render = visibility.applied(renderers.render)
+    values = torch.ones(1000, device="cuda", requires_grad=True)
+
+    def noted(given: Tensor) -> Any:
+        outputs = rasterize(given, busy=2_000_000_000)  # about a second
+        visibility.note(outputs)
+        return outputs
+
+    found = render(noted, values)
+    done = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
+    done.record()
+    assert len(found["visible"]) == 1000
+    assert not done.query()
+
+
+def test_only_what_looks_like_it_is_changed(renderers: ModuleType) -> None:
+    visibility = EarlyVisibility()
+    assert visibility.applied(renderers.render) is not renderers.render
+    assert visibility.applied(renderers.render_masked) is renderers.render_masked
+    assert visibility.applied(sys.exit) is sys.exit
