@@ -8,11 +8,22 @@ from typing import Any
 import pytest
 import torch
 
+from lapgs_plugin.checkouts.logged_numbers import READ
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
-from lapgs_plugin.runner import checkout_ssim
+from lapgs_plugin.runner import checkout_ssim, late_numbers
+from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.stage_model import StageModel
-from tests.contract.stub_runs import FORKS, KINDS, SHORT, STUBS, STUBS_AND_KINDS, composed_psnr, run_hierarchy
+from tests.contract.stub_runs import (
+    FORKS,
+    ITERATIONS,
+    KINDS,
+    SHORT,
+    STUBS,
+    STUBS_AND_KINDS,
+    composed_psnr,
+    run_hierarchy,
+)
 
 
 @pytest.mark.parametrize(("name", "kind"), STUBS_AND_KINDS)
@@ -60,3 +71,33 @@ def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.Monkey
         assert len(called) == (31 if on else 0)
         found.append(composed_psnr(archive))
     assert found[0] == pytest.approx(found[1], abs=0.2)  # dB; worst seen 2e-4
+
+
+@pytest.mark.parametrize(("name", "kind"), STUBS_AND_KINDS)
+def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop logs the same numbers, and trains the same field to the bit."""
+    late: list[torch.Tensor] = []
+    asked: list[torch.Tensor] = []
+    indices = EarlyVisibility.indices
+
+    def read(tensor: torch.Tensor) -> Any:
+        late.append(tensor)
+        return late_numbers.read(tensor)
+
+    def noted(visibility: EarlyVisibility, radii: torch.Tensor) -> torch.Tensor:
+        asked.append(radii)
+        return indices(visibility, radii)
+
+    monkeypatch.setitem(late_numbers.NAMES, READ, read)
+    monkeypatch.setattr(EarlyVisibility, "indices", noted)
+    found = []
+    for on in (True, False):
+        late.clear()
+        asked.clear()
+        archive, result = run_hierarchy(STUBS[name], scene, tmp_path / str(on), hierarchy=kind, run_ahead=on)
+        assert len(late) == (ITERATIONS if on else 0)
+        assert (len(asked) >= ITERATIONS) == on
+        fields = [archive.field(level) for level in (1, 0)]
+        found.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
+    assert found[0][0] == found[1][0]
+    assert all(map(torch.equal, found[0][1], found[1][1]))

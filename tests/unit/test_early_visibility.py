@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
-from pathlib import Path
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -32,14 +31,8 @@ def render_masked(rasterizer, values):
 
 
 @pytest.fixture
-def renderers(tmp_path: Path) -> ModuleType:
-    path = tmp_path / "renderers.py"
-    path.write_text(RENDERERS)
-    spec = importlib.util.spec_from_file_location("renderers", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def renderers(load_module: Callable[[str], ModuleType]) -> ModuleType:
+    return load_module(RENDERERS)
 
 
 class _Rasterized(torch.autograd.Function):
