@@ -1,63 +1,78 @@
-"""Compile a function of a checkout again with some of its expressions replaced; its file stays as it is."""
+"""Compile a function of a checkout again from its changed syntax tree; its file stays as it is. Imports no torch."""
 
 from __future__ import annotations
+import __future__
 
 import ast
+import copy
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from functools import reduce
 from pathlib import Path
-from types import CodeType, FunctionType
-from typing import Any
+from types import FunctionType
+from typing import Any, NamedTuple
 
 from lapgs_plugin.checkouts.syntax import parsed_quietly
 
 FACTORY = "_lapgs_made_again"
-"""Name of the function that defines the function again; what replaces expressions are its arguments."""
+"""Name of the function that defines the function again; what its tree calls beside its globals are its arguments."""
+
+MADE = "_lapgs_made"
+"""Attribute of functions that were made again."""
+
+FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
+
+
+class _Made(NamedTuple):
+    """Hold the tree of a function that was made again, and what it calls beside its globals."""
+
+    tree: ast.FunctionDef
+    names: Mapping[str, Callable[..., Any]]
 
 
 def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
-    """Return the syntax tree of a plain function at the top of its module, not to be changed; None for others.
+    """Return a copy of the syntax tree of a plain function at the top of its module; None for others.
 
-    Decorated functions and closures are others: they hold what their sources do not say.
+    Decorated and wrapped functions and closures are others: they do more than their trees say.
     """
-    if not isinstance(function, FunctionType) or function.__closure__ is not None:
+    if not isinstance(function, FunctionType) or hasattr(function, "__wrapped__"):
         return None
-    code = function.__code__
-    definitions = [node for node in parsed_quietly(Path(code.co_filename)).body if isinstance(node, ast.FunctionDef)]
-    for node in definitions:
-        if (node.name, node.lineno) == (code.co_name, code.co_firstlineno) and not node.decorator_list:
-            return node
-    return None
+    made: _Made | None = getattr(function, MADE, None)
+    if made is not None:
+        return copy.deepcopy(made.tree)
+    code, path = function.__code__, Path(function.__code__.co_filename)
+    if function.__closure__ is not None or not path.is_file():
+        return None
+    functions = [node for node in parsed_quietly(path).body if isinstance(node, ast.FunctionDef)]
+    place = code.co_name, code.co_firstlineno
+    found = next((node for node in functions if (node.name, node.lineno) == place), None)
+    return None if found is None or found.decorator_list else copy.deepcopy(found)
 
 
 def made_again(
-    function: Callable[..., Any], tree: ast.FunctionDef, names: Mapping[str, Callable[..., Any]]
+    function: Callable[..., Any], tree: ast.FunctionDef, names: Mapping[str, Callable[..., Any]] | None = None
 ) -> Callable[..., Any]:
-    """Return a function by its changed tree, with the globals, defaults and line numbers of the original.
+    """Return a function by its changed tree, with the globals and line numbers of the original.
 
     Args:
-        function: one that has a `tree_of`.
-        tree: a changed copy of that tree.
-        names: what the tree calls beside the original's variables.
+        function: the original.
+        tree: a changed `tree_of` it.
+        names: what the tree calls beside the original's globals, and beside the names that the original was made with.
     """
-    assert isinstance(function, FunctionType), "others have no tree"
-    tree.args.defaults, tree.args.kw_defaults = [], [None] * len(tree.args.kwonlyargs)  # evaluated by the original
-    tree.returns = None
-    for given in ast.walk(tree.args):
-        if isinstance(given, ast.arg):
-            given.annotation = None
+    before: _Made | None = getattr(function, MADE, None)
+    names = {**({} if before is None else before.names), **(names or {})}
+    original = inspect.unwrap(function)
+    assert isinstance(original, FunctionType), "as it has a tree"
     module = ast.parse(f"def {FACTORY}({', '.join(names)}):\n    return {tree.name}")
     factory = module.body[0]
     assert isinstance(factory, ast.FunctionDef), "as it was written"
-    factory.body.insert(0, tree)
-    code = next(_functions(compile(module, function.__code__.co_filename, "exec", dont_inherit=True)))
-    made = FunctionType(code, function.__globals__)(*names.values())
-    assert isinstance(made, FunctionType), "the factory defines one"
-    made.__defaults__, made.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
-    made.__annotations__, made.__dict__ = function.__annotations__, dict(function.__dict__)
-    made.__qualname__, made.__doc__, made.__module__ = function.__qualname__, function.__doc__, function.__module__
+    factory.body.insert(0, ast.fix_missing_locations(copy.deepcopy(tree)))
+    # The checkout's future statements, and not those of this file.
+    flags = original.__code__.co_flags & FUTURE
+    compiled = compile(module, original.__code__.co_filename, "exec", flags, dont_inherit=True)
+    defined: dict[str, Any] = {}
+    exec(compiled, original.__globals__, defined)
+    made: Callable[..., Any] = defined[FACTORY](*names.values())
+    made.__qualname__ = function.__qualname__
+    setattr(made, MADE, _Made(tree, names))
     return made
-
-
-def _functions(code: CodeType) -> Iterator[CodeType]:
-    return (each for each in code.co_consts if inspect.iscode(each))

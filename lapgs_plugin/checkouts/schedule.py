@@ -5,18 +5,16 @@ A loop compares its variable with options, arguments and numbers: `iteration < o
 """
 
 from __future__ import annotations
-import __future__
 
 import ast
 import builtins
 import copy
-import inspect
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from typing import Any, cast
 
+from lapgs_plugin.checkouts.rewriting import made_again, tree_of
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 RARE = 10
@@ -39,8 +37,6 @@ LIBRARIES = ("torch", "np", "numpy", "math", "random", "os", "time", "sys", "F",
 """Modules whose functions say nothing about what an event does."""
 
 FLIPPED = {ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE}
-
-FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
 
 Place = tuple[int, int, int | None, int | None]
 
@@ -370,16 +366,9 @@ class StageSchedule:
         }
         if not (self._numbers or self._moved or elsewhere):
             return original
+        tree = tree_of(original) or copy.deepcopy(self._function)  # changed before, or of the script
         rewriter = _Rewriter(self._numbers, self._moved, elsewhere, self._variable)
-        tree = ast.Module([rewriter.visit(copy.deepcopy(self._function))], type_ignores=[])
-        original = inspect.unwrap(original)
-        code = original.__code__
-        made: dict[str, Any] = {}
-        flags = code.co_flags & FUTURE
-        compiled = compile(ast.fix_missing_locations(tree), code.co_filename, "exec", flags, dont_inherit=True)
-        exec(compiled, original.__globals__, made)
-        result: Callable[..., Any] = made[self._function.name]
-        return result
+        return made_again(original, rewriter.visit(tree))
 
 
 @dataclass

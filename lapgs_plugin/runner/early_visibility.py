@@ -8,7 +8,6 @@ and tiles, whose number they return, from the same projection. So the indices ar
 from __future__ import annotations
 
 import ast
-import copy
 import logging
 from collections.abc import Callable
 from typing import Any
@@ -40,7 +39,7 @@ class EarlyVisibility:
         if tree is None or not any(_radii(node) for node in ast.walk(tree)):
             return renderer
         logger.info("%s finds the Gaussians that it shows while it blends the image", renderer.__name__)
-        return made_again(renderer, _Visible().visit(copy.deepcopy(tree)), {VISIBLE: self.indices})
+        return made_again(renderer, _Visible().visit(tree), {VISIBLE: self.indices})
 
     def note(self, outputs: Any) -> None:
         """Note the radii among the outputs of a rasterizer that has counted its pairs."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import inspect
 import logging
 import numbers
 import operator
@@ -131,10 +131,9 @@ def reading_late(training: Callable[..., Any]) -> Callable[..., Any]:
     tree = tree_of(training)
     if tree is None:
         return training
-    changed = copy.deepcopy(tree)
-    late = LateNumbers(changed, parsed(Path(training.__code__.co_filename)))
+    late = LateNumbers(tree, parsed(Path(inspect.getfile(training))))
     if not late.found:
         return training
-    late.visit(changed)
+    late.visit(tree)
     logger.info("%d numbers that %s only logs are read when they are shown", late.found, training.__name__)
-    return made_again(training, changed, NAMES)
+    return made_again(training, tree, NAMES)
