@@ -20,6 +20,7 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import TrainingCall
+from lapgs_plugin.checkouts.viewer_port import sharing_ports
 from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
@@ -78,6 +79,7 @@ class BareRunRecorder:
             )
         return [
             writing_whole_files(),
+            *sharing_ports(profile),
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
             *timing_replacements(profile, lambda: self),

@@ -10,6 +10,7 @@ from typing import Any
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
+from lapgs_plugin.checkouts.viewer_port import sharing_ports
 from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_ssim
@@ -49,6 +50,7 @@ class StageReplacements:
         require_matching_rasterizer(profile, adapter.info.title)
         return [
             writing_whole_files(),
+            *sharing_ports(profile),
             *self._in_training(profile),
             *(
                 Replacement(camera, "__init__", self._context.images.adopting, "the scene's loader, for every image")
