@@ -26,15 +26,25 @@ COUNTED = "num_rendered"
 MARK = "_lapgs_projected"
 """Attribute of radii that are there; it holds their version."""
 
+COMPARED = 20
+"""Renders at first of which the indices are compared with those that are waited for."""
+
 
 class EarlyVisibility:
     """Find visible Gaussians early in the renders of a checkout."""
 
     def __init__(self) -> None:
         self._stream: torch.cuda.Stream | None = None
+        self._compared, self._works = 0, True
+        self._made: dict[Callable[..., Any], Callable[..., Any]] = {}
 
     def applied(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
         """Return a renderer that finds visible Gaussians early, or as it is if it looks for them in another way."""
+        if renderer not in self._made:  # several modules hold it
+            self._made[renderer] = self._changed(renderer)
+        return self._made[renderer]
+
+    def _changed(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
         tree = tree_of(renderer)
         if tree is None or not any(_radii(node) for node in ast.walk(tree)):
             return renderer
@@ -52,8 +62,19 @@ class EarlyVisibility:
     def indices(self, radii: Tensor) -> Tensor:
         """Return `(radii > 0).nonzero()`."""
         version = getattr(radii, MARK, None)
-        if version is None or version != radii._version:
+        if version is None or version != radii._version or not self._works:
             return (radii > 0).nonzero()
+        found = self._found_early(radii)
+        if self._compared < COMPARED:
+            self._compared += 1
+            waited_for = (radii > 0).nonzero()
+            if not torch.equal(found, waited_for):
+                self._works = False
+                logger.warning("visible Gaussians are waited for: this rasterizer counts before its radii are there")
+                return waited_for
+        return found
+
+    def _found_early(self, radii: Tensor) -> Tensor:
         if self._stream is None:
             # Ahead of the image's blocks that wait.
             self._stream = torch.cuda.Stream(radii.device, priority=-1)  # type: ignore[no-untyped-call]  # torch's

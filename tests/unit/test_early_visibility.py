@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lapgs_plugin.runner import early_visibility
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
 
 DEVICES = ["cpu", pytest.param("cuda", marks=[
@@ -80,7 +81,8 @@ def test_indices_are_the_same(renderers: ModuleType, device: str, counts: bool) 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_image_is_not_waited_for(renderers: ModuleType) -> None:
+def test_the_image_is_not_waited_for(renderers: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(early_visibility, "COMPARED", 0)
     visibility = EarlyVisibility()
     render = visibility.applied(renderers.render)
     values = torch.ones(1000, device="cuda", requires_grad=True)
@@ -95,6 +97,23 @@ def test_the_image_is_not_waited_for(renderers: ModuleType) -> None:
     done.record()
     assert len(found["visible"]) == 1000
     assert not done.query()
+
+
+def test_radii_that_are_not_there_yet(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Of a rasterizer whose number of pairs is no count of theirs: once they differ, they are waited for."""
+    visibility, asked = EarlyVisibility(), list[Tensor]()
+
+    def found_early(radii: Tensor) -> Tensor:
+        asked.append(radii)
+        return (radii > len(asked) // 3).nonzero()
+
+    monkeypatch.setattr(visibility, "_found_early", found_early)
+    for _ in range(6):
+        radii = torch.tensor([0, 1, 0, 3, 2], dtype=torch.int32)
+        setattr(radii, early_visibility.MARK, radii._version)
+        assert visibility.indices(radii).tolist() == [[1], [3], [4]]
+    assert len(asked) == 3
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
 
 
 def test_only_what_looks_like_it_is_changed(renderers: ModuleType) -> None:
