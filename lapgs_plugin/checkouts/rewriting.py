@@ -6,7 +6,7 @@ import __future__
 import ast
 import copy
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from types import FunctionType
@@ -31,22 +31,39 @@ class _Made(NamedTuple):
 
 
 def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
-    """Return a copy of the syntax tree of a plain function at the top of its module; None for others.
+    """Return a copy of the syntax tree of a plain function or method of a module; None for others.
 
-    Decorated and wrapped functions and closures are others: they do more than their trees say.
+    Decorated and wrapped functions, closures and methods that use `super()` or private names are others: they do more
+    than their trees say.
     """
     if not isinstance(function, FunctionType) or hasattr(function, "__wrapped__"):
         return None
     made: _Made | None = getattr(function, MADE, None)
     if made is not None:
         return copy.deepcopy(made.tree)
-    code, path = function.__code__, Path(function.__code__.co_filename)
+    path = Path(function.__code__.co_filename)
     if function.__closure__ is not None or not path.is_file():
         return None
-    functions = [node for node in parsed_quietly(path).body if isinstance(node, ast.FunctionDef)]
-    place = code.co_name, code.co_firstlineno
-    found = next((node for node in functions if (node.name, node.lineno) == place), None)
+    found = _definition(function, parsed_quietly(path).body)
     return None if found is None or found.decorator_list else copy.deepcopy(found)
+
+
+def _definition(function: FunctionType, body: Sequence[ast.stmt]) -> ast.FunctionDef | None:
+    *classes, name = function.__qualname__.split(".")
+    for each in classes:
+        found = (node.body for node in body if isinstance(node, ast.ClassDef) and node.name == each)
+        body = next(found, ())
+    place = name, function.__code__.co_firstlineno
+    functions = (node for node in body if isinstance(node, ast.FunctionDef) and (node.name, node.lineno) == place)
+    definition = next(functions, None)
+    is_private = definition is not None and any(map(_is_private, ast.walk(definition)))
+    return None if classes and is_private else definition
+
+
+def _is_private(node: ast.AST) -> bool:
+    """Return whether Python gives a name another one inside a class."""
+    name = getattr(node, "id", getattr(node, "attr", ""))
+    return isinstance(name, str) and name.startswith("__") and not name.endswith("__")
 
 
 def made_again(
@@ -66,7 +83,7 @@ def made_again(
     module = ast.parse(f"def {FACTORY}({', '.join(names)}):\n    return {tree.name}")
     factory = module.body[0]
     assert isinstance(factory, ast.FunctionDef), "as it was written"
-    factory.body.insert(0, ast.fix_missing_locations(copy.deepcopy(tree)))
+    factory.body.insert(0, copy.deepcopy(ast.fix_missing_locations(tree)))
     # The checkout's future statements, and not those of this file.
     flags = original.__code__.co_flags & FUTURE
     compiled = compile(module, original.__code__.co_filename, "exec", flags, dont_inherit=True)

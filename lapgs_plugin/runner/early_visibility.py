@@ -1,15 +1,17 @@
-"""Find the Gaussians that a view shows while its image is still being blended.
+"""Find the Gaussians that a view shows without waiting for the GPU's other work.
 
 Renderers of the family return `(radii > 0).nonzero()`, which waits for everything that the GPU was given, so for the
-image as well; the loss is given to the GPU afterwards. Radii are there before: rasterizers count the pairs of Gaussians
-and tiles, whose number they return, from the same projection. So the indices are found in a stream of their own.
+image as well; the loss is given to the GPU afterwards. Most forks return the mask `radii > 0`, and their loops index
+with it several times after the backward pass, `x[mask]`: each time waits, and finds the same indices again. Radii are
+there before: rasterizers count the pairs of Gaussians and tiles, whose number they return, from the same projection.
+So the indices are found in a stream of their own, once a render.
 """
 
 from __future__ import annotations
 
 import ast
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
@@ -19,12 +21,14 @@ from lapgs_plugin.checkouts.rewriting import made_again, tree_of
 
 logger = logging.getLogger(__name__)
 
-VISIBLE = "_lapgs_visible"
-"""Name of what takes the place of `(radii > 0).nonzero()`."""
+VISIBLE, MASK, INDEX = "_lapgs_visible", "_lapgs_mask", "_lapgs_index"
+"""Names of what takes the place of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
 COUNTED = "num_rendered"
 """Attribute in which the family's rasterizers keep the number of pairs for their backward pass."""
-MARK = "_lapgs_projected"
-"""Attribute of radii that are there; it holds their version."""
+KEY = "visibility_filter"
+"""Name of the mask or the indices among what the family's renderers return."""
+PROJECTED, RADII, INDICES = "_lapgs_projected", "_lapgs_radii", "_lapgs_indices"
+"""Attributes of radii that are there, which holds their version; of a mask: its radii, and its indices."""
 
 COMPARED = 20
 """Renders at first of which the indices are compared with those that are waited for."""
@@ -38,18 +42,21 @@ class EarlyVisibility:
         self._compared, self._works = 0, True
         self._made: dict[Callable[..., Any], Callable[..., Any]] = {}
 
-    def applied(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a renderer that finds visible Gaussians early, or as it is if it looks for them in another way."""
+    def in_renderer(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a renderer whose indices and masks of visible Gaussians are those of this object."""
         if renderer not in self._made:  # several modules hold it
-            self._made[renderer] = self._changed(renderer)
+            self._made[renderer] = _changed(renderer, _Visible(), {VISIBLE: self.indices, MASK: self.mask})
         return self._made[renderer]
 
-    def _changed(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
-        tree = tree_of(renderer)
-        if tree is None or not any(_radii(node) for node in ast.walk(tree)):
-            return renderer
-        logger.info("%s finds the Gaussians that it shows while it blends the image", renderer.__name__)
-        return made_again(renderer, _Visible().visit(tree), {VISIBLE: self.indices})
+    def in_loop(self, training: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a training function that indexes by the indices of a renderer's masks."""
+        return _changed(training, _Indexed(_filters(training)), {INDEX: self.index})
+
+    def in_statistics(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a method that indexes by the indices of the masks that it is called with."""
+        tree = tree_of(method)
+        names = () if tree is None else [each.arg for each in tree.args.args]
+        return _changed(method, _Indexed(names), {INDEX: self.index})
 
     def note(self, outputs: Any) -> None:
         """Note the radii among the outputs of a rasterizer that has counted its pairs."""
@@ -57,12 +64,11 @@ class EarlyVisibility:
         if any(type(getattr(each.grad_fn, COUNTED, None)) is int for each in found):
             for each in found:
                 if each.ndim == 1 and each.dtype == torch.int32 and each.is_cuda:
-                    setattr(each, MARK, each._version)
+                    setattr(each, PROJECTED, each._version)
 
-    def indices(self, radii: Tensor) -> Tensor:
+    def indices(self, radii: Any) -> Any:
         """Return `(radii > 0).nonzero()`."""
-        version = getattr(radii, MARK, None)
-        if version is None or version != radii._version or not self._works:
+        if not (self._works and _is_noted(radii)):
             return (radii > 0).nonzero()
         found = self._found_early(radii)
         if self._compared < COMPARED:
@@ -74,9 +80,25 @@ class EarlyVisibility:
                 return waited_for
         return found
 
+    def mask(self, radii: Any) -> Any:
+        """Return `radii > 0`."""
+        found = radii > 0
+        if self._works and _is_noted(radii):
+            setattr(found, RADII, radii)
+        return found
+
+    def index(self, mask: Any) -> Any:
+        """Return a mask, or its indices (k,) if they are found early."""
+        radii = getattr(mask, RADII, None)
+        if radii is None or mask._version > 0 or not _is_noted(radii):  # any of them may be changed in place
+            return mask
+        if getattr(mask, INDICES, None) is None:
+            setattr(mask, INDICES, self.indices(radii).squeeze(1))
+        return getattr(mask, INDICES)
+
     def _found_early(self, radii: Tensor) -> Tensor:
         if self._stream is None:
-            # Ahead of the image's blocks that wait.
+            # Ahead of the blocks of other work that wait.
             self._stream = torch.cuda.Stream(radii.device, priority=-1)  # type: ignore[no-untyped-call]  # torch's
         with torch.cuda.stream(self._stream):
             found = (radii > 0).nonzero()  # waits for this stream
@@ -84,25 +106,88 @@ class EarlyVisibility:
         return found
 
 
-class _Visible(ast.NodeTransformer):
-    """Replace `(radii > 0).nonzero()`."""
-
-    def visit_Call(self, node: ast.Call) -> ast.AST:  # as NodeTransformer has it
-        self.generic_visit(node)
-        radii = _radii(node)
-        if radii is None:
-            return node
-        made = ast.Call(ast.Name(VISIBLE, ast.Load()), [radii], [])
-        return ast.fix_missing_locations(ast.copy_location(made, node))
+def _is_noted(radii: Any) -> bool:
+    """Return whether radii are there, as they were when the rasterizer returned them."""
+    version = getattr(radii, PROJECTED, None)
+    return version is not None and bool(version == radii._version)
 
 
-def _radii(node: ast.AST) -> ast.Name | None:
-    """Return the variable of `(radii > 0).nonzero()`."""
+def _changed(function: Callable[..., Any], change: _Change, names: dict[str, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function with the changes to its tree, or as it is if there are none."""
+    tree = tree_of(function)
+    if tree is None:
+        return function
+    changed = change.visit(tree)
+    return made_again(function, changed, names) if change.found else function
+
+
+class _Change(ast.NodeTransformer):
+    """Replace expressions by calls.
+
+    Attributes:
+        found: number of them.
+    """
+
+    def __init__(self) -> None:
+        self.found = 0
+
+    def _call(self, name: str, argument: ast.expr) -> ast.Call:
+        self.found += 1
+        return ast.copy_location(ast.Call(ast.Name(name, ast.Load()), [argument], []), argument)
+
+
+class _Visible(_Change):
+    """Replace `(radii > 0).nonzero()` and `radii > 0`."""
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        """Return the node, or what takes its place."""
+        match node:
+            case ast.Call(func=ast.Attribute(ast.Compare() as compared, "nonzero"), args=[], keywords=[]):
+                radii = _above_zero(compared)
+                return self.generic_visit(node) if radii is None else self._call(VISIBLE, radii)
+            case ast.Compare() if (radii := _above_zero(node)) is not None:
+                return self._call(MASK, radii)
+        return self.generic_visit(node)
+
+
+def _above_zero(node: ast.Compare) -> ast.Name | None:
+    """Return the variable of `variable > 0`."""
     match node:
-        case ast.Call(
-            func=ast.Attribute(ast.Compare(ast.Name() as radii, [ast.Gt()], [ast.Constant(0)]), "nonzero"),
-            args=[],
-            keywords=[],
-        ):
+        case ast.Compare(left=ast.Name() as radii, ops=[ast.Gt()], comparators=[ast.Constant(0)]):
             return radii
     return None
+
+
+class _Indexed(_Change):
+    """Replace masks in `x[mask]` and `x[mask, ...]`.
+
+    Args:
+        names: variables that may be masks.
+    """
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__()
+        self._names = names
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        """Return the node with the indices."""
+        self.generic_visit(node)
+        match node.slice:
+            case ast.Name(id=name) as mask if name in self._names:
+                node.slice = self._call(INDEX, mask)
+            case ast.Tuple(elts=[ast.Name(id=name) as mask, *others], ctx=context) if name in self._names:
+                node.slice = ast.copy_location(ast.Tuple([self._call(INDEX, mask), *others], context), mask)
+        return node
+
+
+def _filters(training: Callable[..., Any]) -> set[str]:
+    """Return the variables of a training function that are set to what its renderer has under `KEY`, or beside it."""
+    tree = tree_of(training)
+    statements = [] if tree is None else [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
+    setting = [node for node in statements if any(_is_key(each) for each in ast.walk(node.value))]
+    stored = [each for node in setting for target in node.targets for each in ast.walk(target)]
+    return {each.id for each in stored if isinstance(each, ast.Name)}
+
+
+def _is_key(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and node.value == KEY

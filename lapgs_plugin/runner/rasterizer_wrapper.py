@@ -53,6 +53,7 @@ class RasterizerWrapper:
         visibility: finds visible Gaussians early; None leaves it to the renderers.
 
     Attributes:
+        visibility: as given.
         rendering: how the running stage is rendered; None leaves every call unchanged.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
@@ -60,7 +61,7 @@ class RasterizerWrapper:
     def __init__(
         self, mark: Callable[[str], None] = lambda part: None, visibility: EarlyVisibility | None = None
     ) -> None:
-        self._mark, self._visibility = mark, visibility
+        self._mark, self.visibility = mark, visibility
         self.rendering: StageRendering | None = None
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
@@ -70,7 +71,7 @@ class RasterizerWrapper:
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
-        made = original if self._visibility is None else self._visibility.applied(original)
+        made = original if self.visibility is None else self.visibility.in_renderer(original)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
@@ -146,8 +147,8 @@ class RasterizerWrapper:
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
             def marked(**inputs: Any) -> Any:
                 outputs = rasterizer(**inputs)
-                if self._visibility is not None:
-                    self._visibility.note(outputs)
+                if self.visibility is not None:
+                    self.visibility.note(outputs)
                 self._mark("loss")
                 return outputs
 

@@ -20,6 +20,9 @@ from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import is_trained, timing_replacements
 
+STATISTICS = "add_densification_stats"
+"""Method of the family's models that sums gradients of the Gaussians that a view shows."""
+
 SIZE_LIMIT = "max_screen_size"
 """Parameter of the family's density control: with None it removes no Gaussian for its size."""
 
@@ -94,10 +97,10 @@ class StageReplacements:
                 control[name] = lambda original: self._make_density_control(_without_size_limit(original))
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
-        return [
-            *of_class(profile.model, "training_setup", self._make_training_setup, "training()"),
-            *(each for name, make in control.items() for each in of_class(profile.model, name, make, "training()")),
-        ]
+        made: dict[str, Callable[..., Any]] = {"training_setup": self._make_training_setup, **control}
+        if (visibility := self._context.wrapper.visibility) is not None:
+            made[STATISTICS] = visibility.in_statistics
+        return [each for name, make in made.items() for each in of_class(profile.model, name, make, "training()")]
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""
@@ -113,7 +116,8 @@ class StageReplacements:
         return [Replacement(*place, checkout_ssim.in_our_kernels, "training() in its loss") for place in found]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        made = reading_late(original) if self._context.options.run_ahead else original
+        visibility = self._context.wrapper.visibility
+        made = original if visibility is None else visibility.in_loop(reading_late(original))
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:

@@ -12,7 +12,7 @@ from lapgs_plugin.checkouts.logged_numbers import READ
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
 from lapgs_plugin.runner import checkout_ssim, late_numbers
-from lapgs_plugin.runner.early_visibility import EarlyVisibility
+from lapgs_plugin.runner.early_visibility import PROJECTED, EarlyVisibility
 from lapgs_plugin.runner.stage_model import StageModel
 from tests.contract.stub_runs import (
     FORKS,
@@ -101,3 +101,29 @@ def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkey
         found.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
     assert found[0][0] == found[1][0]
     assert all(map(torch.equal, found[0][1], found[1][1]))
+
+
+@pytest.mark.parametrize("name", [*STUBS, *FORKS])
+def test_visible_gaussians(name: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, where radii are there when a rasterizer has returned: the same field to the bit."""
+    asked: list[torch.Tensor] = []
+
+    def note(visibility: EarlyVisibility, outputs: Any) -> None:
+        for each in outputs:
+            if isinstance(each, torch.Tensor) and (each.ndim, each.dtype) == (1, torch.int32):
+                setattr(each, PROJECTED, each._version)
+
+    def found_early(visibility: EarlyVisibility, radii: torch.Tensor) -> torch.Tensor:
+        asked.append(radii)
+        return (radii > 0).nonzero()
+
+    monkeypatch.setattr(EarlyVisibility, "note", note)
+    monkeypatch.setattr(EarlyVisibility, "_found_early", found_early)
+    stub, fields = {**STUBS, **FORKS}[name], []
+    for on in (True, False):
+        archive, _ = run_hierarchy(stub, scene, tmp_path / str(on), *SHORT, hierarchy="laplacian", run_ahead=on)
+        fields.append([archive.field(level) for level in (1, 0)])
+    assert len(asked) > 0
+    for ours, plain in zip(*fields, strict=True):
+        assert torch.equal(ours.means, plain.means)
+        assert torch.equal(ours.sh, plain.sh)
