@@ -56,7 +56,7 @@ class LateNumbers(ast.NodeTransformer):
             if _is_read(call, events) and (waits := uses.waiting([call])) is not None and call not in waits:
                 self._late.add(call)
                 self._waited_for |= waits
-        self._timed = {name for call in self._late if _method(call) == "elapsed_time" for name in _variables(call)}
+        self._timed = {name for call in self._late for name in _events(call)}
         loops = [node for node in nodes if isinstance(node, (ast.For, ast.While))]
         inside = [node for loop in loops for node in ast.walk(loop)]
         self._waits = set() if CLOCKS & _called(inside) else {node for node in inside if _is_wait(node)}
@@ -75,8 +75,8 @@ class LateNumbers(ast.NodeTransformer):
         match node:
             case ast.Expr(value=value) if value in self._waits:
                 return ast.Pass()
-            case ast.Expr(value=ast.Call(func=ast.Attribute(ast.Name(id=event), "record"), args=args)):
-                made = _call(RECORD, ast.Name(event, ast.Load()), *args)
+            case ast.Expr(value=ast.Call(ast.Attribute(ast.Name(id=event), "record"), args, keywords)):
+                made = ast.Call(ast.Name(RECORD, ast.Load()), [ast.Name(event, ast.Load()), *args], keywords)
                 return ast.Assign([ast.Name(event, ast.Store())], made) if event in self._timed else node
             case ast.Call(func=ast.Attribute(value, "item")) if node in self._late:
                 return _call(READ, value)
@@ -185,15 +185,9 @@ def _is_read(node: ast.AST, events: set[str]) -> TypeGuard[ast.Call]:
     match node:
         case ast.Call(func=ast.Attribute(attr="item"), args=[], keywords=[]):
             return True
-        case ast.Call(func=ast.Attribute(ast.Name(), "elapsed_time"), args=[ast.Name()], keywords=[]):
-            return _variables(node) <= events
+        case ast.Call(func=ast.Attribute(attr="elapsed_time")):
+            return {*_events(node)} <= events and len(_events(node)) > 0
     return False
-
-
-def _variables(call: ast.AST) -> set[str]:
-    """Return the variables of two events of which the time between is asked for."""
-    names = [node for node in ast.walk(call) if isinstance(node, ast.Name)]
-    return {node.id for node in names}
 
 
 def _method(call: ast.AST) -> str:
@@ -211,12 +205,25 @@ def _call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def _local_events(nodes: Iterable[ast.AST]) -> set[str]:
-    """Return the variables of a function that it only sets to new events."""
+    """Return the variables of a function that it only sets to new events, records and reads times of."""
     nodes = list(nodes)
-    stored = Counter(n.id for n in nodes if isinstance(n, ast.Name) and not isinstance(n.ctx, ast.Load))
+    names = [node for node in nodes if isinstance(node, ast.Name)]
+    loaded = Counter(node.id for node in names if isinstance(node.ctx, ast.Load))
+    stored = Counter(node.id for node in names if not isinstance(node.ctx, ast.Load))
     made = Counter(name for node in nodes if (name := _new_event(node)) is not None)
+    used = Counter(name for node in nodes for name in _events(node))
     shared = {name for n in nodes if isinstance(n, (ast.Global, ast.Nonlocal)) for name in n.names}
-    return {name for name, count in made.items() if stored[name] == count} - shared
+    return {name for name in made if (stored[name], loaded[name]) == (made[name], used[name])} - shared
+
+
+def _events(node: ast.AST) -> tuple[str, ...]:
+    """Return the variables of events that are recorded, or of which the time between is asked for."""
+    match node:
+        case ast.Expr(value=ast.Call(func=ast.Attribute(ast.Name(id=event), "record"))):
+            return (event,)
+        case ast.Call(func=ast.Attribute(ast.Name(id=start), "elapsed_time"), args=[ast.Name(id=end)], keywords=[]):
+            return start, end
+    return ()
 
 
 def _new_event(node: ast.AST) -> str | None:

@@ -114,10 +114,10 @@ def elapsed_now(start: Any, end: Any) -> Any:
     return start.elapsed_time(end)
 
 
-def recorded(event: Any, *stream: Any) -> Any:
+def recorded(event: Any, *stream: Any, **named: Any) -> Any:
     """Return a new event like this one, recorded: the present one may be that of a late number."""
     made = type(event)(enable_timing=True)
-    made.record(*stream)
+    made.record(*stream, **named)
     return made
 
 

@@ -6,7 +6,7 @@ import operator
 import re
 import traceback
 from collections.abc import Callable
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -84,7 +84,7 @@ class Event:
     def __init__(self, enable_timing=False):
         self.time = None
         Event.made.append(self)
-    def record(self):
+    def record(self, stream=None):
         clock[0] += 1
         self.time = clock[0]
     def synchronize(self):
@@ -116,7 +116,7 @@ def training(losses, writer=None, *, verbose=True):
     mean, total_time, last = 0.0, 0.0, None
     for i, loss in enumerate(losses):
         start.record()
-        end.record()
+        end.record(stream=None)
         torch.cuda.synchronize()
         value = loss.item()
         mean = 0.4 * value + 0.6 * mean
@@ -199,6 +199,7 @@ def test_waiting_for_a_clock_stays(load_module: Callable[[str], ModuleType], cha
     [
         # An event that others hold, too, is not made anew; its time is read at once, when it has ended.
         ("end = torch.cuda.Event(enable_timing=True)", "end = others.end", ["event"] * 3),
+        ("        end.record(stream=None)", "        others.record(end)", ["event"] * 3),
         # A function that does more than to show a time gets it at once.
         ('writer.add_scalar("iter_time", elapsed, step)', "waits.append(elapsed)", ["event"] * 3),
         ("mean, total_time, last = 0.0, 0.0, None", "global total\n    mean, total_time, last = 0.0, 0.0, None", []),
@@ -209,7 +210,7 @@ def test_what_others_see_is_not_late(
 ) -> None:
     text = LOOP.replace(old, new).replace("total_time +=", "total +=" if "global" in new else "total_time +=")
     loop = load_module(text)
-    loop.others = type("Others", (), {"end": loop.Event()})
+    loop.others = SimpleNamespace(end=loop.Event(), record=loop.Event.record)
     reading_late(loop.training)(losses(3), verbose=False)
     assert loop.waits == (waits if "global" not in new else ["event"] * 3)
     assert type(loop.total) is float
