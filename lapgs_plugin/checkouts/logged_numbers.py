@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 from collections import Counter
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import TypeGuard
 
 from lapgs_plugin.checkouts.syntax import called_names
@@ -35,8 +36,9 @@ class LateNumbers(ast.NodeTransformer):
     formatted, or given to a function of the script that does the same. They return late numbers, which are waited for
     when they are formatted; wherever else a variable with such a number is used, it becomes `NUMBER(variable)`.
 
-    Events of late times are made anew by each `a.record()`. `torch.cuda.synchronize()` in a loop is left out unless the
-    loop reads a clock of the processor; other times of events then wait for their end, `ELAPSED_NOW(a, b)`.
+    Events of late times are made anew by each `a.record()`. `torch.cuda.synchronize()` right before a time of events is
+    left out in a loop unless that reads a clock of the processor; times that are not late wait for their end,
+    `ELAPSED_NOW(a, b)`.
 
     Args:
         function: the training function, for `visit`, which changes it.
@@ -59,7 +61,9 @@ class LateNumbers(ast.NodeTransformer):
         self._timed = {name for call in self._late for name in _events(call)}
         loops = [node for node in nodes if isinstance(node, (ast.For, ast.While))]
         inside = [node for loop in loops for node in ast.walk(loop)]
-        self._waits = set() if CLOCKS & _called(inside) else {node for node in inside if _is_wait(node)}
+        self._waits = (
+            set() if CLOCKS & _called(inside) else {wait for node in inside for wait in _waits_for_times(node)}
+        )
         self.found = len(self._late)
 
     def visit(self, node: ast.AST) -> ast.AST:
@@ -233,5 +237,13 @@ def _new_event(node: ast.AST) -> str | None:
     return None
 
 
-def _is_wait(node: ast.AST) -> bool:
-    return isinstance(node, ast.Call) and ast.unparse(node) == "torch.cuda.synchronize()"
+def _waits_for_times(node: ast.AST) -> list[ast.expr]:
+    """Return the calls of `torch.cuda.synchronize()` in a block that are right before a time of events."""
+    found = []
+    for block in (getattr(node, name, None) for name in ("body", "orelse", "finalbody")):
+        statements = block if isinstance(block, list) else []  # a lambda's body is an expression
+        for statement, following in pairwise(statements):
+            times = any(_method(each) == "elapsed_time" for each in ast.walk(following))
+            if times and isinstance(statement, ast.Expr) and ast.unparse(statement) == "torch.cuda.synchronize()":
+                found.append(statement.value)
+    return found

@@ -366,7 +366,7 @@ class StageSchedule:
         }
         if not (self._numbers or self._moved or elsewhere):
             return original
-        tree = tree_of(original) or copy.deepcopy(self._function)  # changed before, or of the script
+        tree = tree_of(original) or copy.deepcopy(self._function)  # if it was changed before
         rewriter = _Rewriter(self._numbers, self._moved, elsewhere, self._variable)
         return made_again(original, rewriter.visit(tree))
 

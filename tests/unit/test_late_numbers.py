@@ -117,9 +117,9 @@ def training(losses, writer=None, *, verbose=True):
     for i, loss in enumerate(losses):
         start.record()
         end.record(stream=None)
-        torch.cuda.synchronize()
         value = loss.item()
         mean = 0.4 * value + 0.6 * mean
+        torch.cuda.synchronize()
         elapsed = start.elapsed_time(end)
         total_time += elapsed / 1e3
         report(writer, elapsed, loss=loss.item(), step=i)
@@ -192,6 +192,14 @@ def test_waiting_for_a_clock_stays(load_module: Callable[[str], ModuleType], cha
     loop = load_module(LOOP.replace(*change))
     reading_late(loop.training)(losses(3), verbose=False)
     assert loop.waits == (["all"] * 3 if "perf_counter" in change[1] else [])
+
+
+def test_waiting_for_anything_else_stays(load_module: Callable[[str], ModuleType]) -> None:
+    """As for a copy to the processor that the script started itself."""
+    text = LOOP.replace("        value = loss.item()", "        torch.cuda.synchronize()\n        value = loss.item()")
+    loop = load_module(text)
+    reading_late(loop.training)(losses(3), verbose=False)
+    assert loop.waits == ["all"] * 3
 
 
 @pytest.mark.parametrize(
