@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import TypeGuard
 
-from lapgs_plugin.checkouts.syntax import called_names
+from lapgs_plugin.checkouts.rewriting import Change, call
+from lapgs_plugin.checkouts.syntax import called_methods, called_names
 
 ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.Div)
 SHOWING = {"format", "add_scalar", "set_postfix"}
@@ -29,7 +30,7 @@ RECORD, NUMBER = "_lapgs_record", "_lapgs_number"
 """Names of what takes the place of `a.record()`, and of what waits for a number."""
 
 
-class LateNumbers(ast.NodeTransformer):
+class LateNumbers(Change):
     """Change a training function so that it goes on while the GPU computes numbers that it logs.
 
     `x.item()` becomes `READ(x)` and `a.elapsed_time(b)` becomes `ELAPSED(a, b)` where the number is added, multiplied,
@@ -54,16 +55,15 @@ class LateNumbers(ast.NodeTransformer):
         uses, events = _Uses(function, functions), _local_events(nodes)
         self._late: set[ast.AST] = set()
         self._waited_for: set[ast.AST] = set()
-        for call in nodes:
-            if _is_read(call, events) and (waits := uses.waiting([call])) is not None and call not in waits:
-                self._late.add(call)
-                self._waited_for |= waits
-        self._timed = {name for call in self._late for name in _events(call)}
+        for node in nodes:
+            if _is_read(node, events) and (waiting := uses.waiting([node])) is not None and node not in waiting:
+                self._late.add(node)
+                self._waited_for |= waiting
+        self._timed = {name for read in self._late for name in _events(read)}
         loops = [node for node in nodes if isinstance(node, (ast.For, ast.While))]
         inside = [node for loop in loops for node in ast.walk(loop)]
-        self._waits = (
-            set() if CLOCKS & _called(inside) else {wait for node in inside for wait in _waits_for_times(node)}
-        )
+        reads_clock = not CLOCKS.isdisjoint({*called_names(inside), *called_methods(inside)})
+        self._waits = set() if reads_clock else {wait for node in inside for wait in _waits_for_times(node)}
         self.found = len(self._late)
 
     def visit(self, node: ast.AST) -> ast.AST:
@@ -71,7 +71,7 @@ class LateNumbers(ast.NodeTransformer):
         made = self._instead_of(node)
         if node in self._waited_for:
             assert isinstance(made, ast.expr), "a variable, or what is computed with it"
-            made = _call(NUMBER, made)
+            made = call(NUMBER, made)
         return made if made is node else ast.fix_missing_locations(ast.copy_location(made, node))
 
     def _instead_of(self, node: ast.AST) -> ast.AST:
@@ -80,12 +80,13 @@ class LateNumbers(ast.NodeTransformer):
             case ast.Expr(value=value) if value in self._waits:
                 return ast.Pass()
             case ast.Expr(value=ast.Call(ast.Attribute(ast.Name(id=event), "record"), args, keywords)):
-                made = ast.Call(ast.Name(RECORD, ast.Load()), [ast.Name(event, ast.Load()), *args], keywords)
+                made = call(RECORD, ast.Name(event, ast.Load()), *args)
+                made.keywords = keywords
                 return ast.Assign([ast.Name(event, ast.Store())], made) if event in self._timed else node
             case ast.Call(func=ast.Attribute(value, "item")) if node in self._late:
-                return _call(READ, value)
+                return call(READ, value)
             case ast.Call(func=ast.Attribute(value, "elapsed_time"), args=args, keywords=[]):
-                return _call(ELAPSED if node in self._late else ELAPSED_NOW, value, *args)
+                return call(ELAPSED if node in self._late else ELAPSED_NOW, value, *args)
         return node
 
 
@@ -112,7 +113,7 @@ class _Uses:
 
         None if they get into variables that others see.
         """
-        shared = {name for node in self._nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
+        shared = _shared(self._nodes)
         known, waiting = set(names), set[ast.AST]()
         open_numbers = [*numbers, *(each for name in known for each in self._loads(name))]
         while open_numbers:
@@ -198,26 +199,19 @@ def _method(call: ast.AST) -> str:
     return call.func.attr if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) else ""
 
 
-def _called(nodes: Iterable[ast.AST]) -> set[str]:
-    """Return the names of functions and methods that are called."""
-    nodes = list(nodes)
-    return {*called_names(nodes), *map(_method, nodes)}
+def _shared(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the variables that a function shares with others."""
+    return {name for node in nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
 
 
-def _call(name: str, *arguments: ast.expr) -> ast.Call:
-    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
-
-
-def _local_events(nodes: Iterable[ast.AST]) -> set[str]:
+def _local_events(nodes: Sequence[ast.AST]) -> set[str]:
     """Return the variables of a function that it only sets to new events, records and reads times of."""
-    nodes = list(nodes)
     names = [node for node in nodes if isinstance(node, ast.Name)]
     loaded = Counter(node.id for node in names if isinstance(node.ctx, ast.Load))
     stored = Counter(node.id for node in names if not isinstance(node.ctx, ast.Load))
     made = Counter(name for node in nodes if (name := _new_event(node)) is not None)
     used = Counter(name for node in nodes for name in _events(node))
-    shared = {name for n in nodes if isinstance(n, (ast.Global, ast.Nonlocal)) for name in n.names}
-    return {name for name in made if (stored[name], loaded[name]) == (made[name], used[name])} - shared
+    return {name for name in made if (stored[name], loaded[name]) == (made[name], used[name])} - _shared(nodes)
 
 
 def _events(node: ast.AST) -> tuple[str, ...]:
@@ -243,7 +237,7 @@ def _waits_for_times(node: ast.AST) -> list[ast.expr]:
     for block in (getattr(node, name, None) for name in ("body", "orelse", "finalbody")):
         statements = block if isinstance(block, list) else []  # a lambda's body is an expression
         for statement, following in pairwise(statements):
-            times = any(_method(each) == "elapsed_time" for each in ast.walk(following))
+            times = "elapsed_time" in called_methods(ast.walk(following))
             if times and isinstance(statement, ast.Expr) and ast.unparse(statement) == "torch.cuda.synchronize()":
                 found.append(statement.value)
     return found

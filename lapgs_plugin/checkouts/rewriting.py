@@ -30,6 +30,41 @@ class _Made(NamedTuple):
     names: Mapping[str, Callable[..., Any]]
 
 
+class Change(ast.NodeTransformer):
+    """Change the tree of a function.
+
+    Attributes:
+        found: number of changes, known when the tree was visited.
+    """
+
+    found = 0
+
+
+def call(name: str, *arguments: ast.expr) -> ast.Call:
+    """Return a call of a function by its name, without a place in the source."""
+    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
+
+
+def rewritten(
+    function: Callable[..., Any],
+    change: Callable[[ast.FunctionDef], Change],
+    names: Mapping[str, Callable[..., Any]],
+) -> Callable[..., Any]:
+    """Return a function with a change to its tree, or as it is if that finds nothing or there is no tree.
+
+    Args:
+        function: the function.
+        change: returns the change to a tree.
+        names: what the changed tree calls beside the function's globals.
+    """
+    tree = tree_of(function)
+    if tree is None:
+        return function
+    found = change(tree)
+    changed = found.visit(tree)
+    return made_again(function, changed, names) if found.found else function
+
+
 def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
     """Return a copy of the syntax tree of a plain function or method of a module; None for others.
 
@@ -83,7 +118,7 @@ def made_again(
     module = ast.parse(f"def {FACTORY}({', '.join(names)}):\n    return {tree.name}")
     factory = module.body[0]
     assert isinstance(factory, ast.FunctionDef), "as it was written"
-    factory.body.insert(0, copy.deepcopy(ast.fix_missing_locations(tree)))
+    factory.body.insert(0, ast.fix_missing_locations(tree))
     # The checkout's future statements, and not those of this file.
     flags = original.__code__.co_flags & FUTURE
     compiled = compile(module, original.__code__.co_filename, "exec", flags, dont_inherit=True)

@@ -12,7 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
-from lapgs_plugin.checkouts.syntax import called_names, executed_on_import, parsed, parsed_quietly, place
+from lapgs_plugin.checkouts.syntax import (
+    called_methods,
+    called_names,
+    executed_on_import,
+    parsed,
+    parsed_quietly,
+    place,
+)
 from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import as_pip_argument
@@ -342,11 +349,8 @@ def _find_training(tree: ast.Module) -> ast.FunctionDef | None:
     called = [name for block in blocks for name in called_names(ast.walk(block))]
     # Some main blocks call a function that calls the one that trains.
     called += [name for outer in called if outer in functions for name in called_names(ast.walk(functions[outer]))]
-    return next((functions[n] for n in called if n in functions and "backward" in _methods_called(functions[n])), None)
-
-
-def _methods_called(node: ast.AST) -> set[str]:
-    return {n.func.attr for n in ast.walk(node) if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)}
+    found = (functions[name] for name in called if name in functions)
+    return next((each for each in found if "backward" in called_methods(ast.walk(each))), None)
 
 
 def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:

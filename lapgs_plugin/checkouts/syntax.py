@@ -51,8 +51,8 @@ def plain_assignments(function: ast.FunctionDef) -> list[ast.stmt]:
     Variables that other statements set too, such as those of a loop, are left out.
     """
     plain = [node for node in function.body if _only_assigns(node)]
-    others = {name for node in function.body if node not in plain for name in _stored(node)}
-    return [node for node in plain if not _stored(node) & others]
+    others = {name for node in function.body if node not in plain for name in stored_names(node)}
+    return [node for node in plain if not stored_names(node) & others]
 
 
 def _only_assigns(node: ast.stmt) -> bool:
@@ -67,7 +67,8 @@ def _only_assigns(node: ast.stmt) -> bool:
     )
 
 
-def _stored(node: ast.AST) -> set[str]:
+def stored_names(node: ast.AST) -> set[str]:
+    """Return the names of variables that a node sets."""
     return {each.id for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
 
 
@@ -79,3 +80,8 @@ def place(path: Path, root: Path, line: int) -> str:
 def called_names(nodes: Iterable[ast.AST]) -> list[str]:
     """Return the names of functions that are called by their names alone, one for each call."""
     return [n.func.id for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+
+
+def called_methods(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the names of methods that are called, of whatever object or module."""
+    return {n.func.attr for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)}

@@ -17,7 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.checkouts.rewriting import made_again, tree_of
+from lapgs_plugin.checkouts.rewriting import Change, call, rewritten
+from lapgs_plugin.checkouts.syntax import stored_names
 
 logger = logging.getLogger(__name__)
 
@@ -45,18 +46,17 @@ class EarlyVisibility:
     def in_renderer(self, renderer: Callable[..., Any]) -> Callable[..., Any]:
         """Return a renderer whose indices and masks of visible Gaussians are those of this object."""
         if renderer not in self._made:  # several modules hold it
-            self._made[renderer] = _changed(renderer, _Visible(), {VISIBLE: self.indices, MASK: self.mask})
+            names = {VISIBLE: self.indices, MASK: self.mask}
+            self._made[renderer] = rewritten(renderer, lambda _: _Visible(), names)
         return self._made[renderer]
 
     def in_loop(self, training: Callable[..., Any]) -> Callable[..., Any]:
         """Return a training function that indexes by the indices of a renderer's masks."""
-        return _changed(training, _Indexed(_filters(training)), {INDEX: self.index})
+        return rewritten(training, lambda tree: _Indexed(_filters(tree)), {INDEX: self.index})
 
     def in_statistics(self, method: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that indexes by the indices of the masks that it is called with."""
-        tree = tree_of(method)
-        names = () if tree is None else [each.arg for each in tree.args.args]
-        return _changed(method, _Indexed(names), {INDEX: self.index})
+        return rewritten(method, lambda tree: _Indexed({each.arg for each in tree.args.args}), {INDEX: self.index})
 
     def note(self, outputs: Any) -> None:
         """Note the radii among the outputs of a rasterizer that has counted its pairs."""
@@ -112,31 +112,15 @@ def _is_noted(radii: Any) -> bool:
     return version is not None and bool(version == radii._version)
 
 
-def _changed(function: Callable[..., Any], change: _Change, names: dict[str, Callable[..., Any]]) -> Callable[..., Any]:
-    """Return a function with the changes to its tree, or as it is if there are none."""
-    tree = tree_of(function)
-    if tree is None:
-        return function
-    changed = change.visit(tree)
-    return made_again(function, changed, names) if change.found else function
-
-
-class _Change(ast.NodeTransformer):
-    """Replace expressions by calls.
-
-    Attributes:
-        found: number of them.
-    """
-
-    def __init__(self) -> None:
-        self.found = 0
+class _Replacing(Change):
+    """Replace expressions by calls."""
 
     def _call(self, name: str, argument: ast.expr) -> ast.Call:
         self.found += 1
-        return ast.copy_location(ast.Call(ast.Name(name, ast.Load()), [argument], []), argument)
+        return ast.copy_location(call(name, argument), argument)
 
 
-class _Visible(_Change):
+class _Visible(_Replacing):
     """Replace `(radii > 0).nonzero()` and `radii > 0`."""
 
     def visit(self, node: ast.AST) -> ast.AST:
@@ -158,7 +142,7 @@ def _above_zero(node: ast.Compare) -> ast.Name | None:
     return None
 
 
-class _Indexed(_Change):
+class _Indexed(_Replacing):
     """Replace masks in `x[mask]` and `x[mask, ...]`.
 
     Args:
@@ -166,7 +150,6 @@ class _Indexed(_Change):
     """
 
     def __init__(self, names: Collection[str]) -> None:
-        super().__init__()
         self._names = names
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
@@ -180,13 +163,11 @@ class _Indexed(_Change):
         return node
 
 
-def _filters(training: Callable[..., Any]) -> set[str]:
+def _filters(training: ast.FunctionDef) -> set[str]:
     """Return the variables of a training function that are set to what its renderer has under `KEY`, or beside it."""
-    tree = tree_of(training)
-    statements = [] if tree is None else [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
+    statements = [node for node in ast.walk(training) if isinstance(node, ast.Assign)]
     setting = [node for node in statements if any(_is_key(each) for each in ast.walk(node.value))]
-    stored = [each for node in setting for target in node.targets for each in ast.walk(target)]
-    return {each.id for each in stored if isinstance(each, ast.Name)}
+    return {name for node in setting for name in stored_names(node)}
 
 
 def _is_key(node: ast.AST) -> bool:

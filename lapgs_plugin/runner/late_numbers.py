@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import logging
 import numbers
@@ -13,7 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from lapgs_plugin.checkouts.logged_numbers import ELAPSED, ELAPSED_NOW, NUMBER, READ, RECORD, LateNumbers
-from lapgs_plugin.checkouts.rewriting import made_again, tree_of
+from lapgs_plugin.checkouts.rewriting import rewritten
 from lapgs_plugin.checkouts.syntax import parsed
 
 logger = logging.getLogger(__name__)
@@ -22,23 +23,31 @@ MOST_PENDING = 100
 """Numbers that may depend on one another before the first of them is waited for."""
 
 
+def _methods(compute: Callable[[Any, Any], Any]) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
+    """Return the two methods of an operator: of a late number with another one, and of another one with it."""
+    return lambda late, other: _computed(compute, late, other), lambda late, other: _computed(compute, other, late)
+
+
 class LateNumber:
     """Stand for a number that a GPU computes. It is waited for when it is converted or formatted.
 
     Args:
         read: returns the number, waiting for it.
         pending: how many numbers it is computed from that nobody has waited for.
+
+    Attributes:
+        pending: as given, until it is waited for.
     """
 
-    __slots__ = ("_pending", "_read", "_value")
+    __slots__ = ("_read", "_value", "pending")
 
     def __init__(self, read: Callable[[], float], pending: int = 1) -> None:
         self._read: Callable[[], float] | None = read
-        self._value, self._pending = 0.0, pending
+        self._value, self.pending = 0.0, pending
 
     def __float__(self) -> float:
         if self._read is not None:
-            self._value, self._read, self._pending = self._read(), None, 0
+            self._value, self._read, self.pending = self._read(), None, 0
         return self._value
 
     def __format__(self, specification: str) -> str:
@@ -50,33 +59,10 @@ class LateNumber:
     def __neg__(self) -> Any:
         return -1.0 * self
 
-    def __add__(self, other: Any) -> Any:
-        return _computed(operator.add, self, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return _computed(operator.add, other, self)
-
-    def __sub__(self, other: Any) -> Any:
-        return _computed(operator.sub, self, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return _computed(operator.sub, other, self)
-
-    def __mul__(self, other: Any) -> Any:
-        return _computed(operator.mul, self, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return _computed(operator.mul, other, self)
-
-    def __truediv__(self, other: Any) -> Any:
-        return _computed(operator.truediv, self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return _computed(operator.truediv, other, self)
-
-    @property
-    def pending(self) -> int:
-        return self._pending
+    __add__, __radd__ = _methods(operator.add)
+    __sub__, __rsub__ = _methods(operator.sub)
+    __mul__, __rmul__ = _methods(operator.mul)
+    __truediv__, __rtruediv__ = _methods(operator.truediv)
 
 
 numbers.Real.register(LateNumber)  # loggers and progress bars ask for a number before they convert it
@@ -128,12 +114,11 @@ NAMES: dict[str, Callable[..., Any]] = {
 
 def reading_late(training: Callable[..., Any]) -> Callable[..., Any]:
     """Return a script's training function, which waits for the GPU no more where it reads what it only logs."""
-    tree = tree_of(training)
-    if tree is None:
-        return training
-    late = LateNumbers(tree, parsed(Path(inspect.getfile(training))))
-    if not late.found:
-        return training
-    late.visit(tree)
-    logger.info("%d numbers that %s only logs are read when they are shown", late.found, training.__name__)
-    return made_again(training, tree, NAMES)
+
+    def late(tree: ast.FunctionDef) -> LateNumbers:
+        change = LateNumbers(tree, parsed(Path(inspect.getfile(training))))
+        if change.found:
+            logger.info("%d numbers that %s only logs are read when they are shown", change.found, training.__name__)
+        return change
+
+    return rewritten(training, late, NAMES)

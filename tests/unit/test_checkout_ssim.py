@@ -12,10 +12,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from lapgs_plugin.runner.checkout_ssim import in_our_kernels
-
-DEVICES = ["cpu", pytest.param("cuda", marks=[
-    pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-])]  # fmt: skip
+from tests.devices import DEVICES
 
 
 class Convolved:

@@ -12,10 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.runner import early_visibility
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
-
-DEVICES = ["cpu", pytest.param("cuda", marks=[
-    pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-])]  # fmt: skip
+from tests.devices import DEVICES
 
 RENDERERS = """
 def render(rasterizer, values, keep=None):
@@ -53,8 +50,15 @@ class _Rasterized(torch.autograd.Function):
         return None, None, None
 
 
-def rasterize(values: Tensor, busy: int = 0, counts: bool = True) -> Any:
-    return _Rasterized.apply(values, busy, counts)  # type: ignore[no-untyped-call]  # torch's
+def noting(visibility: EarlyVisibility, busy: int = 0, counts: bool = True) -> Callable[[Tensor], Any]:
+    """Return a rasterizer whose radii are noted."""
+
+    def rasterize(values: Tensor) -> Any:
+        outputs = _Rasterized.apply(values, busy, counts)  # type: ignore[no-untyped-call]  # torch's
+        visibility.note(outputs)
+        return outputs
+
+    return rasterize
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -64,11 +68,7 @@ def test_indices_are_the_same(renderers: ModuleType, device: str, counts: bool) 
     render = visibility.in_renderer(renderers.render)
     values = torch.randn(1000, generator=torch.Generator().manual_seed(0)).mul(3).to(device).requires_grad_()
 
-    def noted(given: Tensor) -> Any:
-        outputs = rasterize(given, counts=counts)
-        visibility.note(outputs)
-        return outputs
-
+    noted = noting(visibility, counts=counts)
     found = render(noted, values)
     assert torch.equal(found["visible"], (found["radii"] > 0).nonzero())
     changed = render(noted, values, torch.arange(0, 1000, 2, device=device))
@@ -86,11 +86,7 @@ def test_the_image_is_not_waited_for(renderers: ModuleType, monkeypatch: pytest.
     render = visibility.in_renderer(renderers.render)
     values = torch.ones(1000, device="cuda", requires_grad=True)
 
-    def noted(given: Tensor) -> Any:
-        outputs = rasterize(given, busy=2_000_000_000)  # about a second
-        visibility.note(outputs)
-        return outputs
-
+    noted = noting(visibility, busy=2_000_000_000)  # about a second
     found = render(noted, values)
     done = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
     done.record()
@@ -155,11 +151,6 @@ def test_masks_index_by_their_indices(
         monkeypatch.setattr(visibility, "note", note)
         monkeypatch.setattr(visibility, "_found_early", lambda radii: found.append(radii) or (radii > 0).nonzero())
 
-    def noted(given: Tensor) -> Any:
-        outputs = rasterize(given)
-        visibility.note(outputs)
-        return outputs
-
     def change(mask: Tensor, radii: Tensor) -> None:
         (mask if changed == "mask" else radii)[::2] = 0
 
@@ -175,7 +166,7 @@ def test_masks_index_by_their_indices(
             method = visibility.in_statistics(module.Model.add_densification_stats)
             monkeypatch.setattr(module.Model, "add_densification_stats", method)
         given = None if changed == "nothing" else change
-        states.append([*training(render, noted, model, values, gradients, given), model.sums, model.views])
+        states.append([*training(render, noting(visibility), model, values, gradients, given), model.sums, model.views])
     assert all(map(torch.equal, *states))
     assert render is not module.render_masked
     assert training is not module.training

@@ -13,10 +13,7 @@ from torch import Tensor
 
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam, fuse_steps
-
-DEVICES = ["cpu", pytest.param("cuda", marks=[
-    pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-])]  # fmt: skip
+from tests.devices import DEVICES
 
 
 @pytest.fixture
