@@ -190,11 +190,7 @@ class Densifier(DensityControl):
 
         It covers all Gaussians: gsplat selects visible ones, and the processor waits for a GPU to learn their number.
         """
-        gradient = self._gradient(result)  # (n, 2) or (b, n, 2)
-        if self.state["grad2d"] is None:
-            self.state["grad2d"], self.state["count"] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
-        size = camera.width, camera.height
-        add_statistics(gradient, result.radii, size, self.state["grad2d"], self.state["count"])
+        add_gradients(self.state, ("grad2d", "count"), self._gradient(result), result, camera)
 
     def _gradient(self, result: RenderResult) -> Tensor:
         """Return gradients by the centres on the image, (n, 2) or (b, n, 2), absolute if the options say so."""
@@ -206,6 +202,23 @@ class Densifier(DensityControl):
         reset_opa(model.params, model.optimizers, self.state, value=highest)
 
 
+def add_gradients(
+    state: dict[str, Any], names: tuple[str, str], gradient: Tensor, result: RenderResult, camera: Camera
+) -> None:
+    """Add the gradient norms of a render, and the views that show each Gaussian, to two statistics of a `state`.
+
+    Args:
+        state: of density control, edited in place.
+        names: of the sum of norms and of the count of views, (n,) each; None before the first render.
+        gradient: (n, 2) or (b, n, 2) by the centres on the image.
+        result, camera: as `DensityControl.accumulate` takes them.
+    """
+    norms, counts = names
+    if state[norms] is None:
+        state[norms], state[counts] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
+    add_statistics(gradient, result.radii, camera.size, state[norms], state[counts])
+
+
 def required(gradient: Tensor | None, source: str) -> Tensor:
     """Return a gradient of a `RenderResult`.
 
@@ -215,6 +228,6 @@ def required(gradient: Tensor | None, source: str) -> Tensor:
     if gradient is None:
         raise UserInputError(
             f"--strategy densifies by the RenderResult's {source}, which this rasterizer leaves empty; choose "
-            "--strategy mcmc, which needs none, or another --rasterizer"
+            "--strategy mcmc, which can do without, or another --rasterizer"
         )
     return gradient

@@ -1,5 +1,5 @@
 """Density control as a Markov chain (Kheradmand et al. 2024): move Gaussians that have become transparent, add some up
-to a limit, and shake positions.
+to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong.
 
 In plain PyTorch, so that a CPU trains with it as well; gsplat has the same steps for CUDA alone.
 """
@@ -17,15 +17,19 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.position_noise import add_noise
 from lapgs_plugin.ops.position_noise.in_torch import displacements
-from lapgs_plugin.training.densification import DensityControl, ViewScores
+from lapgs_plugin.training.densification import DensityControl, ViewScores, add_gradients
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Mcmc
 
 START_SCALE, START_OPACITY = 0.1, 0.5
 """Factor on the sizes, and opacity, of a field that starts from points, as MCMC's authors have them."""
-DEAD_OPACITY = 0.005
-"""Gaussians with at most this opacity are moved."""
+DEAD_OPACITY = 0.01
+"""Gaussians with at most this opacity are moved. MCMC's authors wait until it is half of that."""
+LEAST_OPACITY = 0.005
+"""Opacity of copies, at least."""
+STATISTICS_VIEWS = 40
+"""Views before each refinement whose gradients say where Gaussians are needed."""
 MOST_COPIES = 51
 """Gaussians that one Gaussian becomes at once, at most."""
 NOISE = 5e5
@@ -62,9 +66,21 @@ class McmcDensifier(DensityControl):
         super().__init__(options.opacity_weight, options.scale_weight)
         assert options.cap_max is not None, "`Mcmc.of_stage` sets it"
         self._schedule, self._most = schedule, options.cap_max
-        self.state = {"noised": 0, "variance": 0.0}  # the last iteration with noise, and what has come up since
+        # The last iteration with noise, and what has come up since; gradients since statistics began, and their views.
+        self.state = {"noised": 0, "variance": 0.0, "grad2d": None, "count": None}
         times = (schedule.densify_until - schedule.densify_start) // schedule.densify_every
         self._growth = min(max(GROWTH, GROWTH_OF_STAGE ** (1.0 / max(times, 1))), MOST_GROWTH)
+
+    def needs_statistics(self, iteration: int) -> bool:
+        every = self._schedule.densify_every
+        due = math.ceil(iteration / every) * every
+        return self._schedule.refines(due) and due - iteration < STATISTICS_VIEWS
+
+    def accumulate(self, result: RenderResult, camera: Camera) -> None:
+        """Add the gradients by centres of a render, if its rasterizer has any; see `DensityControl`."""
+        gradient = result.means2d.grad if result.absgrad2d is None else result.absgrad2d
+        if gradient is not None:
+            add_gradients(self.state, ("grad2d", "count"), gradient, result, camera)
 
     @torch.no_grad()
     def after_step(
@@ -75,14 +91,17 @@ class McmcDensifier(DensityControl):
         camera: Camera,
         scores: ViewScores | None = None,
     ) -> bool:
+        if result is not None:
+            self.accumulate(result, camera)
         if refines := self._schedule.refines(iteration):
             self._move_dead(model)
             self._add(model)
+            self.state |= {"grad2d": None, "count": None}
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
         self.state["variance"] += rate**2
         if iteration - self.state["noised"] >= NOISE_VIEWS:
             shake(model, NOISE * math.sqrt(self.state["variance"]))
-            self.state = {"noised": iteration, "variance": 0.0}
+            self.state |= {"noised": iteration, "variance": 0.0}
         return refines
 
     def _move_dead(self, model: TrainableField) -> None:
@@ -90,8 +109,9 @@ class McmcDensifier(DensityControl):
         dead = opacities <= DEAD_OPACITY
         places = dead.nonzero()[:, 0]
         if 0 < len(places) < len(dead):
-            chosen = _sample(torch.where(dead, 0.0, opacities), len(places))
+            chosen = _sample(torch.where(dead, 0.0, self._demand(model)), len(places))
             model.forget_moments(_share(model, chosen))
+            self._share_gradients(places, chosen)
             # What is moved keeps its moments: it was visible a moment ago, and its first steps would be long without.
             model.overwrite(places, chosen)
 
@@ -99,9 +119,26 @@ class McmcDensifier(DensityControl):
         grown = max(int(self._growth * len(model)), len(model) + 1)  # 5 % of fewer than 20 Gaussians are none
         count = min(self._most, grown) - len(model)
         if count > 0:
-            chosen = _sample(torch.sigmoid(model.params["opacities"]), count)
+            chosen = _sample(self._demand(model), count)
             _share(model, chosen)
             model.append(chosen)
+
+    def _demand(self, model: TrainableField) -> Tensor:
+        """Return (n,) how much each Gaussian needs others at its place.
+
+        That is its opacity, as MCMC's authors have it, times the mean norm of its gradient on the image, which is large
+        where the image is wrong. Where a rasterizer has no such gradients it is the opacity alone.
+        """
+        opacities = torch.sigmoid(model.params["opacities"])
+        norms, counts = self.state["grad2d"], self.state["count"]
+        return opacities if norms is None else opacities * norms / counts.clamp_min(1)
+
+    def _share_gradients(self, places: Tensor, chosen: Tensor) -> None:
+        """Divide the gradients of Gaussians among them and their copies, which replace those at `places`."""
+        norms, counts = self.state["grad2d"], self.state["count"]
+        if norms is not None:
+            norms /= torch.bincount(chosen, minlength=len(norms)) + 1
+            norms[places], counts[places] = norms[chosen], counts[chosen]
 
 
 def _sample(weights: Tensor, count: int) -> Tensor:
@@ -118,7 +155,7 @@ def _share(model: TrainableField, chosen: Tensor) -> Tensor:
     copies = torch.bincount(chosen)
     rows = copies.nonzero()[:, 0]
     each, factors = copies_of(torch.sigmoid(opacities[rows]), (copies[rows] + 1).clamp_max(MOST_COPIES))
-    opacities[rows] = torch.logit(each.clamp(DEAD_OPACITY, 1.0 - torch.finfo(each.dtype).eps))
+    opacities[rows] = torch.logit(each.clamp(LEAST_OPACITY, 1.0 - torch.finfo(each.dtype).eps))
     log_scales[rows] += torch.log(factors)[:, None]
     return rows
 

@@ -17,8 +17,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
-from lapgs_plugin.ops.densification_statistics import add_statistics
-from lapgs_plugin.training.densification import Densifier, ViewScores, required
+from lapgs_plugin.training.densification import Densifier, ViewScores, add_gradients, required
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import Multiview
@@ -113,11 +112,7 @@ class MultiviewDensifier(Densifier):
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add the statistics of absolute gradients, too; see `DensityControl`."""
         super().accumulate(result, camera)
-        gradient = required(result.absgrad2d, "absgrad2d")
-        if self.state["absgrad2d"] is None:
-            self.state["absgrad2d"], self.state["shown"] = (torch.zeros_like(self.state["count"]) for _ in range(2))
-        size = camera.width, camera.height
-        add_statistics(gradient, result.radii, size, self.state["absgrad2d"], self.state["shown"])
+        add_gradients(self.state, ("absgrad2d", "shown"), required(result.absgrad2d, "absgrad2d"), result, camera)
 
     @torch.no_grad()
     def _refine(

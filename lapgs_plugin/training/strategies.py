@@ -249,6 +249,10 @@ class Mcmc(Regularized):
         least=1,
     )
 
+    @property
+    def needs_absgrad(self) -> bool:
+        return True
+
     def of_stage(self, part: StagePart) -> Self:
         own = self.base_cap_max if part.base and self.base_cap_max is not None else self.cap_max
         most = MOST_GAUSSIANS if part.finest else MOST_GAUSSIANS // 2

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import Hierarchy
 from lapgs_plugin.reference_raster import CpuRasterizer
@@ -105,6 +106,65 @@ def test_the_transparent_move_to_the_opaque_and_keep_their_moments() -> None:
     sources = [int(row) for row in changed if row not in gone]
     assert sources
     assert not model.optimizer_moments()["means"]["exp_avg_sq"][sources].any()
+
+
+def shown(count: int, gradient: Tensor | None, absolute: Tensor | None = None) -> RenderResult:
+    """Return what density control reads of a render of 2x2 pixels, in which a gradient counts as it is."""
+    centres = torch.zeros(count, 2, requires_grad=True)
+    centres.grad = gradient
+    return RenderResult(torch.zeros(()), None, torch.ones(count, dtype=torch.int32), centres, absolute)
+
+
+def test_gaussians_are_added_by_opacity_and_absolute_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights of the draw are opacity times mean gradient norm; nothing is drawn that no view blames."""
+    model = trained_once(4)
+    model.params["opacities"].data = torch.logit(torch.tensor([0.2, 0.4, 0.4, 0.8]))
+    camera = ring_scene().train[0].camera.resized(2, 2)
+    control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=6))
+    model.optimizers["means"].param_groups[0]["lr"] = 0.0
+    seen: list[Tensor] = []
+    monkeypatch.setattr(mcmc, "_sample", lambda weights, count: seen.append(weights) or torch.zeros(count).long())
+    control.accumulate(shown(4, torch.ones(4, 2), torch.tensor([[3.0, 4.0], [0, 1], [0, 0], [1, 0]])), camera)
+    last = shown(4, torch.ones(4, 2), torch.tensor([[0.0, 1.0], [0, 1], [0, 0], [0, 0]]))
+    assert control.after_step(model, 20, last, camera)
+    torch.testing.assert_close(seen[0], torch.tensor([0.2 * 3.0, 0.4 * 1.0, 0.0, 0.8 * 0.5]))
+    assert control.state["grad2d"] is None, "statistics begin anew"
+
+
+def test_without_absolute_gradients_others_count_and_without_any_opacities(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = ring_scene().train[0].camera.resized(2, 2)
+    seen: list[Tensor] = []
+    monkeypatch.setattr(mcmc, "_sample", lambda weights, count: seen.append(weights) or torch.zeros(count).long())
+    for gradient in (torch.tensor([[2.0, 0.0], [0.0, 0.0]]), None):
+        model = trained_once(2)
+        model.params["opacities"].data = torch.logit(torch.tensor([0.5, 0.25]))
+        model.optimizers["means"].param_groups[0]["lr"] = 0.0
+        control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=3))
+        assert control.after_step(model, 20, shown(2, gradient), camera)
+    torch.testing.assert_close(seen[0], torch.tensor([1.0, 0.0]))
+    torch.testing.assert_close(seen[1], torch.tensor([0.5, 0.25]))
+
+
+@given(chosen=st.lists(st.integers(3, 9), min_size=3, max_size=3))
+def test_copies_share_the_gradient_of_the_gaussian_they_replace(chosen: list[int]) -> None:
+    control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=10))
+    norms = torch.arange(10.0)
+    control.state |= {"grad2d": norms.clone(), "count": torch.ones(10)}
+    control._share_gradients(torch.arange(3), torch.tensor(chosen))
+    for source in range(3, 10):
+        rows = [source, *(place for place in range(3) if chosen[place] == source)]
+        shared = control.state["grad2d"][rows]
+        assert shared.sum() == pytest.approx(norms[source].item(), rel=1e-6)  # 1.2e-7 seen
+        assert (shared == shared[0]).all()
+
+
+def test_statistics_are_taken_right_before_refinements_alone() -> None:
+    (stage,) = StagePlan.create((64, 48), 30_000, 1)
+    control = McmcDensifier(StageSchedule.create(TrainSettings(), stage), replace(Mcmc(), cap_max=9))
+    assert [i for i in range(1, 801) if control.needs_statistics(i)] == [
+        *(i for first in (561, 661, 761) for i in range(first, first + 40))
+    ]
+    assert not any(map(control.needs_statistics, range(24_901, 30_001)))
 
 
 def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
