@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage, require_shares
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import check_values, option, option_name, require_positive
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 GRIDS = ("camera", "even")
 """Pixel grids of a pyramid; see `pyramid`."""
@@ -28,6 +31,9 @@ Gaussians than their detail needs, and nested levels keep every one of them to t
 JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
 """Default share of a residual stage, at its end, in which the finished coarser fields are trained as well: a frozen
 coarse level cannot correct errors that the finer level is unable to represent."""
+LARGE_IMAGE = 2_000_000
+"""Pixels of an image from which on some defaults are others: there a view of a residual takes much longer than one of
+its base. They were measured on images of half a megapixel, and of 7 and 13; this is in the middle."""
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
 
@@ -90,8 +96,8 @@ class HierarchySettings:
     )
     split: str | None = option(
         None,
-        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2; "
-        "under `lapgs run` 1/3,2/3.",
+        "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2, "
+        "and 2/3,1/3 for residuals of photos from 2 megapixels on with --strategy mcmc; under `lapgs run` 1/3,2/3.",
         panel=PANEL,
     )
     supervision: str = option(
@@ -110,8 +116,8 @@ class HierarchySettings:
     joint: float | None = option(
         None,
         "Share of each residual level's iterations, at the end, in which the coarser fields are optimized as well; 0 "
-        f"freezes them, as in the paper. Default: {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}; 0.5 in `lapgs train` with "
-        "--strategy mcmc.",
+        f"freezes them, as in the paper. Default: 0.5 in `lapgs train` with --strategy mcmc and under `lapgs run` "
+        f"with photos below 2 megapixels, else {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
         panel=PANEL,
     )
     residual_color_rate: float | None = option(
@@ -263,6 +269,14 @@ class HierarchySettings:
             return parse_split(self.split)
         return DEFAULT_SPLITS.get(self.levels)
 
+    def for_size(self, size: tuple[int, int]) -> Self:
+        """Return settings with the defaults that photos of this size have: here the same for all.
+
+        Args:
+            size: (width, height) of the smallest photo.
+        """
+        return self
+
     def resolved(self) -> dict[str, Any]:
         """Return all fields for manifests, with the hierarchy's defaults filled in: these may change later."""
         values = asdict(self)
@@ -321,3 +335,8 @@ def parse_inheritance(text: str) -> tuple[str, float]:
     if not 0.0 < share <= 1.0:
         raise UserInputError(f"--inherit {text}: expected a ratio above 0 and at most 1 (1 inherits every Gaussian)")
     return mode, share
+
+
+def is_large(size: tuple[int, int]) -> bool:
+    """Return whether an image (width, height) is a `LARGE_IMAGE`."""
+    return size[0] * size[1] >= LARGE_IMAGE

@@ -1,5 +1,6 @@
 """Density control as a Markov chain (Kheradmand et al. 2024): move Gaussians that have become transparent, add some up
-to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong.
+to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong, and bounds the sizes of
+residuals on large images.
 
 In plain PyTorch, so that a CPU trains with it as well; gsplat has the same steps for CUDA alone.
 """
@@ -15,6 +16,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
+from lapgs_plugin.hierarchy.settings import is_large
 from lapgs_plugin.ops.position_noise import add_noise
 from lapgs_plugin.ops.position_noise.in_torch import displacements
 from lapgs_plugin.training.densification import DensityControl, ViewScores, add_gradients
@@ -42,6 +44,13 @@ GROWTH, GROWTH_OF_STAGE, MOST_GROWTH = 1.05, 350.0, 1.5
 as much as the stages of a run of 30,000 iterations."""
 SOLID = 0.1
 """Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
+MOST_SIGMA = 32.0
+"""Largest standard deviation, in pixels, of a residual's Gaussians on a large image. The loss has the mean opacity, so
+that faint Gaussians grow, and those that cover whole views take time and memory in each of its tiles. Detail that is
+so coarse is the base's."""
+NEAR, BESIDE = 0.2, 1.3
+"""Only Gaussians beyond this depth, in world units, and within this factor of the image count as seen by a camera:
+3DGS's limits. Others would be judged by a camera that they pass by."""
 
 
 def mcmc_start(field: GaussianField, scale: float) -> GaussianField:
@@ -102,6 +111,8 @@ class McmcDensifier(DensityControl):
         if iteration - self.state["noised"] >= NOISE_VIEWS:
             shake(model, NOISE * math.sqrt(self.state["variance"]))
             self.state |= {"noised": iteration, "variance": 0.0}
+            if model.signed and is_large(camera.size):
+                bound_sizes(model, camera, MOST_SIGMA)
         return refines
 
     def _move_dead(self, model: TrainableField) -> None:
@@ -204,3 +215,21 @@ def shake(model: TrainableField, amount: float) -> None:
     rows = (torch.sigmoid(logits) < SOLID).nonzero()[:, 0]  # a GPU would wait for their number
     noise = torch.randn(len(rows), 3, dtype=means.dtype)
     means[rows] += displacements(quaternions[rows], log_scales[rows], logits[rows], noise, amount)
+
+
+@torch.no_grad()
+def bound_sizes(model: TrainableField, camera: Camera, most: float) -> None:
+    """Shrink the Gaussians that a camera sees to standard deviations of at most `most` pixels of its image.
+
+    Args:
+        model: edited in place.
+        camera: its longer focal length counts.
+        most: above 0.
+    """
+    means, log_scales = model.params["means"], model.params["scales"]
+    pose = camera.world_to_camera.to(means)
+    x, y, depths = torch.addmm(pose[:3, 3], means, pose[:3, :3].T).unbind(1)
+    wide, high = (BESIDE * tangent for tangent in camera.tan_half_fov)
+    seen = (depths > NEAR) & (x.abs() < wide * depths) & (y.abs() < high * depths)
+    bounds = torch.where(seen, depths * (most / max(camera.fx, camera.fy)), torch.inf).log()
+    torch.minimum(log_scales, bounds[:, None], out=log_scales)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gsplat.strategy import MCMCStrategy, ops
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from torch import Tensor
@@ -23,14 +23,14 @@ from lapgs_plugin.hierarchy.settings import Hierarchy
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import world_covariances
 from lapgs_plugin.training import mcmc
-from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, copies_of, shake
+from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, bound_sizes, copies_of, shake
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
 from tests.training_runs import Said, ring_manifest, train
-from tests.training_scene import blob_field, ring_scene
+from tests.training_scene import blob_field, ring_camera, ring_scene
 
 
 def model_of(field: GaussianField) -> TrainableField:
@@ -254,6 +254,59 @@ def test_noise_of_steps_of_few_views_comes_at_once(monkeypatch: pytest.MonkeyPat
     assert list(amounts) == list(range(together, 97, together))
     variance = sum(amount**2 for amount in amounts.values())
     assert variance == pytest.approx(mcmc.NOISE**2 * sum(step**2 for step in steps[: max(amounts) // views]))
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    place=st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-2, 9)),
+    sigmas=st.tuples(st.floats(0.001, 4), st.floats(0.001, 4), st.floats(0.001, 4)),
+    angle=st.floats(0, 6),
+    most=st.floats(0.5, 64),
+)
+def test_what_a_camera_sees_has_no_standard_deviation_above_the_bound(
+    place: tuple[float, float, float], sigmas: tuple[float, float, float], angle: float, most: float
+) -> None:
+    camera = ring_camera(angle)
+    pose = camera.world_to_camera.double().numpy()
+    x, y, z = place  # as the camera has it, the sides in halves of its image at that depth
+    tangents = camera.tan_half_fov
+    local = np.array([x * tangents[0] * z, y * tangents[1] * z, z])
+    # The limits themselves are left to rounding.
+    assume(min(abs(abs(x) - 1.3), abs(abs(y) - 1.3), abs(z - 0.2)) > 1e-3)
+    blob = blob_field(1)
+    field = blob.with_parameters(
+        {
+            "means": torch.from_numpy((local - pose[:3, 3]) @ pose[:3, :3]).float()[None],
+            "log_scales": torch.tensor([sigmas]).log(),
+        }
+    )
+    model = model_of(field)
+    bound_sizes(model, camera, most)
+    seen = z > 0.2 and abs(x) < 1.3 and abs(y) < 1.3
+    expected = np.minimum(sigmas, most * z / camera.fx) if seen else np.array(sigmas)
+    after = model.params["scales"].detach().exp().numpy()[0]
+    np.testing.assert_allclose(after, expected, rtol=3e-5)  # 2.4e-6 seen
+    small = np.array(sigmas) <= after
+    assert torch.equal(model.params["scales"][0, small], field.log_scales[0, small])
+
+
+@pytest.mark.parametrize(
+    ("signed", "size", "bounded"),
+    [(True, (2000, 1000), True), (True, (1999, 1000), False), (False, (2000, 1000), False)],
+)
+def test_sizes_are_bounded_in_residuals_of_large_images_alone(
+    signed: bool, size: tuple[int, int], bounded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcmc, "shake", lambda model, amount: None)
+    camera = ring_camera(0.0, *size)
+    model = trained_once(5)
+    model.signed = signed
+    with torch.no_grad():
+        model.params["scales"].fill_(0.0)  # a unit, of the four that the camera is away
+    control = McmcDensifier(schedule_of(10_000), replace(Mcmc(), cap_max=30))
+    for iteration in range(1, 9):
+        control.after_step(model, iteration, None, camera)
+    assert (model.params["scales"] < 0).all().item() is bounded
 
 
 def test_nothing_is_due_for_resets_that_never_come() -> None:
