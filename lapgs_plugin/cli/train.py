@@ -296,7 +296,7 @@ def _create(
 
     def check(size: tuple[int, int], photos: int) -> None:
         nonlocal chosen
-        chosen = _for_photos(photos, settings) if choose_iterations else settings
+        chosen = (_for_photos(photos, settings) if choose_iterations else settings).for_size(size)
         require_pruning(make_plan(size, chosen, photos), chosen)
 
     loaded = load_reference(reference, check)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
-from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
+from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings, is_large
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.options import check_values, option, option_name, options_of, require_positive
 from lapgs_plugin.runs.options import PANEL as RUN
@@ -324,6 +324,13 @@ class TrainSettings(HierarchySettings):
         if enough >= self.iterations or timed or self.protocol == "paper":
             return self
         return replace(self, iterations=enough)
+
+    def for_size(self, size: tuple[int, int]) -> TrainSettings:
+        """See `HierarchySettings.for_size`: two levels of residuals are split as the strategy says for large images."""
+        large = self.densification.options.large_split
+        if large is None or not is_large(size) or self.split is not None or self.nested or self.levels != 2:
+            return self
+        return replace(self, split=large)
 
     @property
     def scheduled(self) -> int:

@@ -68,6 +68,7 @@ class Strategy:
         few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
         residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
         residual_color_rate: default of `TrainSettings.residual_color_rate`; None for the hierarchy's.
+        large_split: default of `TrainSettings.split` of two levels for large images; None for that of all others.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -76,6 +77,7 @@ class Strategy:
     few_dropout: ClassVar[float] = 0.0
     residual_joint: ClassVar[float | None] = None
     residual_color_rate: ClassVar[float | None] = None
+    large_split: ClassVar[str | None] = None
 
     @property
     def needs_absgrad(self) -> bool:
@@ -230,6 +232,7 @@ class Mcmc(Regularized):
     few_dropout: ClassVar[float] = 0.2
     residual_joint: ClassVar[float | None] = 0.5
     residual_color_rate: ClassVar[float | None] = 1.0
+    large_split: ClassVar[str | None] = "2/3,1/3"
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )

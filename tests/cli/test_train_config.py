@@ -68,6 +68,17 @@ def test_a_run_on_few_photos_has_iterations_by_their_number(
         assert RunArchive.open(tmp_path / name).manifest.settings["iterations"] == expected
 
 
+@pytest.mark.parametrize(("more", "split"), [([], "2/3,1/3"), (["--split", "1/2,1/2"], "1/2,1/2")])
+def test_a_run_on_large_photos_has_a_longer_base(
+    more: list[str], split: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lapgs_plugin.hierarchy.settings.LARGE_IMAGE", 1)
+    monkeypatch.setattr("lapgs_plugin.training.trainer.Trainer.run", lambda *_: None)
+    monkeypatch.setattr("lapgs_plugin.viewer.preview.save_run_preview", lambda *_, **__: None)
+    lapgs("train", scene, "-o", tmp_path / "run", *more)
+    assert RunArchive.open(tmp_path / "run").manifest.settings["split"] == split
+
+
 def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: Path) -> None:
     run, words = tmp_path / "run", ("train", scene, "-o", tmp_path / "run", "--resume", "--iterations")
     lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)

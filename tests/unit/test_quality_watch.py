@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.strategies import Gradients
 from tests.training_runs import Said, StopAt, resume, train
 from tests.training_scene import ring_scene
 
@@ -184,6 +186,21 @@ def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happe
     assert TrainSettings(densification=Densification(until=9000)).for_photos(43).iterations == 30_000
     assert TrainSettings(densification=Densification(reset_every=0)).for_photos(43).iterations == 12_900
     assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
+
+
+def test_residuals_of_large_photos_have_a_longer_base_unless_something_says_otherwise() -> None:
+    given, large = TrainSettings(), (3093, 2312)
+    assert given.for_size(large).shares == (Fraction(2, 3), Fraction(1, 3))
+    assert given.for_size((1600, 1200)) is given
+    assert given.shares == (Fraction(1, 2), Fraction(1, 2))
+    for other in (
+        TrainSettings(split="1/2,1/2"),
+        TrainSettings(levels=3),
+        TrainSettings(hierarchy="nested"),
+        TrainSettings(protocol="paper"),
+        TrainSettings(densification=Densification(strategy="3dgs", options=Gradients())),
+    ):
+        assert other.for_size(large) is other
 
 
 def test_keep_best_needs_views_to_set_aside(tmp_path: Path) -> None:
