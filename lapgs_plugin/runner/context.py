@@ -37,6 +37,7 @@ class RunContext:
     """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
 
     Attributes:
+        options: of the hierarchy; once the photos are read, with the defaults for their size.
         stage: the running stage, or that of the dry run, which answers the replaced symbols; None between stages.
         returned: what the script's last call of `training` returned, for its main block.
     """

@@ -87,7 +87,7 @@ class HierarchyDriver:
         measuring: MeasuringOptions | None = None,
         watcher: Watcher | None = None,
     ) -> None:
-        self._adapter, self._options = adapter, options
+        self._adapter = adapter
         self._resume, self._overwrite = resume, overwrite
         place, measuring = torch.device(device), measuring or MeasuringOptions()
         parts = IterationParts(place, measuring.breakdown)
@@ -105,6 +105,10 @@ class HierarchyDriver:
         self._replacements = StageReplacements(self._context, self._train)
         self._since: int | None = None  # when the script's main block began, as files have it
         self.folder: Path | None = None
+
+    @property
+    def _options(self) -> RunSettings:
+        return self._context.options
 
     def run(self) -> None:
         """Run the main block.
@@ -136,8 +140,10 @@ class HierarchyDriver:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._context.images.read_masks(source, self._options.masks)
             self._adapter.first_points(len(scene.points.points))
+            size = self._context.images.smallest_size()
+            self._context.options = self._options.for_size(size)
             plan = StagePlan.create(
-                self._context.images.smallest_size(),
+                size,
                 call.opt.iterations,
                 self._options.levels,
                 self._options.shares,

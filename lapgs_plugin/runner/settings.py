@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
-from lapgs_plugin.hierarchy.settings import PANEL, STORAGE, HierarchySettings
+from lapgs_plugin.hierarchy.settings import JOINT_SHARE, PANEL, STORAGE, HierarchySettings, is_large
 from lapgs_plugin.options import option, require_positive
 from lapgs_plugin.runs.options import PANEL as RUN_PANEL
 
 ELSEWHERE = ("levels", "grid", "supervision", "inherit", "seed", "masks", "dry_run")
 """Settings that a manifest has fields of its own for, and one that changes no result."""
+
+SMALL_JOINT_SHARE = 0.5
+"""Default share of a residual stage that is joint unless images are large, where it takes a quarter more time than
+`JOINT_SHARE`."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,17 @@ class RunSettings(HierarchySettings):
             return super().shares
         coarser = self.levels - 1
         return (Fraction(1, 3 * coarser),) * coarser + (Fraction(2, 3),)
+
+    @property
+    def joint_share(self) -> float:
+        """See `HierarchySettings.joint_share`."""
+        return super().joint_share if self.nested or self.joint is not None else SMALL_JOINT_SHARE
+
+    def for_size(self, size: tuple[int, int]) -> RunSettings:
+        """See `HierarchySettings.for_size`: of large images a smaller share of a residual stage is joint."""
+        if not is_large(size) or self.nested or self.joint is not None:
+            return self
+        return replace(self, joint=JOINT_SHARE[self.kind])
 
     def for_manifest(self) -> dict[str, Any]:
         """Return what the manifest has under "settings"."""

@@ -446,7 +446,7 @@ def test_what_nested_levels_cannot_honour_is_refused(
 @pytest.mark.parametrize(
     ("words", "settings", "iterations"),
     [
-        ((), {"hierarchy": "laplacian", "joint": 0.25, "coarse_threshold": 1.0}, [10, 20]),
+        ((), {"hierarchy": "laplacian", "joint": 0.5, "coarse_threshold": 1.0}, [10, 20]),
         (("--hierarchy", "nested"), {"hierarchy": "nested", "joint": 0.0, "coarse_threshold": 2.0}, [10, 20]),
         (("--protocol", "paper"), {"joint": 0.0, "residual_color_rate": 1.0, "inherit": "xyz"}, [10, 20]),
         (
@@ -478,6 +478,25 @@ def test_defaults_go_with_the_hierarchy(
     assert [record.signed for record in manifest.records] == [False, "nested" not in words]
     code, lines = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
     assert (code, lines[-1].partition(" already holds a run")[0]) == (2, "lapgs: run")
+
+
+@pytest.mark.parametrize(
+    ("words", "joint"),
+    [((), 0.25), (("--joint", "0.75"), 0.75), (("--hierarchy", "nested"), 0.0), (("--protocol", "paper"), 0.0)],
+)
+def test_less_of_a_stage_is_joint_where_photos_are_large(
+    words: tuple[str, ...],
+    joint: float,
+    lapgs_run: Any,
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lapgs_plugin.hierarchy.settings.LARGE_IMAGE", 1)
+    of_script = arguments(STUBS["graphdeco"], scene, tmp_path / "run", ("--iterations", 30))
+    code, _ = lapgs_run("--device", "cpu", *words, STUBS["graphdeco"].script, *of_script)
+    assert code == 0
+    assert RunArchive.open(tmp_path / "run").manifest.settings["joint"] == joint
 
 
 def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) -> None:
