@@ -31,9 +31,10 @@ Gaussians than their detail needs, and nested levels keep every one of them to t
 JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
 """Default share of a residual stage, at its end, in which the finished coarser fields are trained as well: a frozen
 coarse level cannot correct errors that the finer level is unable to represent."""
-LARGE_IMAGE = 2_000_000
+LARGE_IMAGE = 2_500_000
 """Pixels of an image from which on some defaults are others: there a view of a residual takes much longer than one of
-its base. They were measured on images of half a megapixel, and of 7 and 13; this is in the middle."""
+its base. They were measured on half a megapixel, 7 and 13; the smallest images whose residuals took 12 GB had 2.56."""
+LARGE = f"{LARGE_IMAGE / 1e6:g} megapixels"
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
 
@@ -97,7 +98,7 @@ class HierarchySettings:
     split: str | None = option(
         None,
         "Share of the iterations for each level, coarsest first, such as 1/3,2/3. Default for two levels: 1/2,1/2, "
-        "and 2/3,1/3 for residuals of photos from 2 megapixels on with --strategy mcmc; under `lapgs run` 1/3,2/3.",
+        f"and 2/3,1/3 for residuals of photos from {LARGE} on with --strategy mcmc; under `lapgs run` 1/3,2/3.",
         panel=PANEL,
     )
     supervision: str = option(
@@ -116,8 +117,8 @@ class HierarchySettings:
     joint: float | None = option(
         None,
         "Share of each residual level's iterations, at the end, in which the coarser fields are optimized as well; 0 "
-        f"freezes them, as in the paper. Default: 0.5 in `lapgs train` with --strategy mcmc and under `lapgs run` "
-        f"with photos below 2 megapixels, else {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
+        "freezes them, as in the paper. Default: 0.5 in `lapgs train` with --strategy mcmc and under `lapgs run` with "
+        f"photos below {LARGE}, else {JOINT_SHARE[Hierarchy.LAPLACIAN]:g}.",
         panel=PANEL,
     )
     residual_color_rate: float | None = option(
