@@ -480,10 +480,7 @@ def test_defaults_go_with_the_hierarchy(
     assert (code, lines[-1].partition(" already holds a run")[0]) == (2, "lapgs: run")
 
 
-@pytest.mark.parametrize(
-    ("words", "joint"),
-    [((), 0.25), (("--joint", "0.75"), 0.75), (("--hierarchy", "nested"), 0.0), (("--protocol", "paper"), 0.0)],
-)
+@pytest.mark.parametrize(("words", "joint"), [((), 0.25), (("--joint", "0.75"), 0.75)])
 def test_less_of_a_stage_is_joint_where_photos_are_large(
     words: tuple[str, ...],
     joint: float,

@@ -98,6 +98,23 @@ def test_the_finest_level_of_a_checkout_has_the_longer_part(given: dict[str, Any
     assert RunSettings(**given).resolved()["split"] == split
 
 
+@pytest.mark.parametrize(
+    ("given", "small", "large"),
+    [
+        ({}, 0.5, 0.25),
+        ({"joint": 0.75}, 0.75, 0.75),
+        ({"hierarchy": "nested"}, 0.0, 0.0),
+        ({"protocol": "paper"}, 0.0, 0.0),
+    ],
+)
+def test_less_of_a_checkouts_stage_is_joint_where_photos_are_large(
+    given: dict[str, Any], small: float, large: float
+) -> None:
+    settings = RunSettings(**given)
+    assert settings.for_size((1920, 1080)).joint_share == settings.joint_share == small
+    assert settings.for_size((2500, 1000)).joint_share == large
+
+
 @pytest.mark.parametrize("levels", range(1, 7))
 def test_every_default_split_sums_to_one(levels: int) -> None:
     plan = StagePlan.create((4096, 4096), 30_000, levels)
