@@ -155,7 +155,7 @@ def random_case(
     camera = make_camera(width, height, pose_seed=seed) if camera is None else camera
     generator = torch.Generator().manual_seed(seed + 1)
     means = points_in_view(n, camera, seed=seed + 2)
-    depth = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3])[:, 2:]  # (n, 1)
+    depth = camera.local(means)[:, 2:]  # (n, 1)
     low, high = math.log(pixels[0]), math.log(pixels[1])
     sizes = torch.exp(low + (high - low) * torch.rand(n, 3, generator=generator, dtype=torch.float64))
     opacities = 0.02 + 0.96 * torch.rand(n, generator=generator, dtype=torch.float64)

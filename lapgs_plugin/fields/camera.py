@@ -51,6 +51,11 @@ class Camera:
         """The (3, 3) matrix K, with the pose's type and device."""
         return self.world_to_camera.new_tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
+    def local(self, points: Tensor) -> Tensor:
+        """Return points (n, 3) of the world in the camera's axes, with their type and device; the last is the depth."""
+        pose = self.world_to_camera.to(points)
+        return points @ pose[:3, :3].T + pose[:3, 3]
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera with exactly the same field of view at another image size."""
         sx, sy = width / self.width, height / self.height

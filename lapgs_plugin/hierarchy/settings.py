@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage, require_shares
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import check_values, option, option_name, require_positive
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 GRIDS = ("camera", "even")
 """Pixel grids of a pyramid; see `pyramid`."""
@@ -269,14 +266,6 @@ class HierarchySettings:
         if self.split is not None:
             return parse_split(self.split)
         return DEFAULT_SPLITS.get(self.levels)
-
-    def for_size(self, size: tuple[int, int]) -> Self:
-        """Return settings with the defaults that photos of this size have: here the same for all.
-
-        Args:
-            size: (width, height) of the smallest photo.
-        """
-        return self
 
     def resolved(self) -> dict[str, Any]:
         """Return all fields for manifests, with the hierarchy's defaults filled in: these may change later."""

@@ -330,7 +330,6 @@ def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
 
 def _centres(field: GaussianField, camera: Camera) -> Tensor:
     """Return projected centres in pixels, (n, 2); meaningless behind the camera."""
-    pose = camera.world_to_camera.to(field.means)
-    x, y, depth = (field.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)  # (n,) each
+    x, y, depth = camera.local(field.means).unbind(-1)  # (n,) each
     centres = torch.stack([camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1)
     return centres.nan_to_num(0, 0, 0)  # NaN of a depth of 0 would survive the multiplication by 0 that culls it

@@ -90,7 +90,11 @@ class RunSettings(HierarchySettings):
         return super().joint_share if self.nested or self.joint is not None else SMALL_JOINT_SHARE
 
     def for_size(self, size: tuple[int, int]) -> RunSettings:
-        """See `HierarchySettings.for_size`: of large images a smaller share of a residual stage is joint."""
+        """Return settings with which less of a residual stage is joint if images are large and no share was given.
+
+        Args:
+            size: (width, height) of the smallest photo.
+        """
         if not is_large(size) or self.nested or self.joint is not None:
             return self
         return replace(self, joint=JOINT_SHARE[self.kind])

@@ -93,7 +93,7 @@ def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
 
 def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Project points: (n,) x and y in image widths and heights, and which of them no nearer one seems to hide."""
-    x, y, depth = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(-1)
+    x, y, depth = camera.local(points).unbind(-1)
     x = (camera.fx * x / depth + camera.cx) / camera.width
     y = (camera.fy * y / depth + camera.cy) / camera.height
     inside = (depth > 0) & (x > 0) & (x < 1) & (y > 0) & (y < 1)

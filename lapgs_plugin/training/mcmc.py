@@ -19,6 +19,7 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.settings import is_large
 from lapgs_plugin.ops.position_noise import add_noise
 from lapgs_plugin.ops.position_noise.in_torch import displacements
+from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
 from lapgs_plugin.training.densification import DensityControl, ViewScores, add_gradients
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
@@ -48,9 +49,6 @@ MOST_SIGMA = 32.0
 """Largest standard deviation, in pixels, of a residual's Gaussians on a large image. The loss has the mean opacity, so
 that faint Gaussians grow, and those that cover whole views take time and memory in each of its tiles. Detail that is
 so coarse is the base's."""
-NEAR, BESIDE = 0.2, 1.3
-"""Only Gaussians beyond this depth, in world units, and within this factor of the image count as seen by a camera:
-3DGS's limits. Others would be judged by a camera that they pass by."""
 
 
 def mcmc_start(field: GaussianField, scale: float) -> GaussianField:
@@ -227,9 +225,9 @@ def bound_sizes(model: TrainableField, camera: Camera, most: float) -> None:
         most: above 0.
     """
     means, log_scales = model.params["means"], model.params["scales"]
-    pose = camera.world_to_camera.to(means)
-    x, y, depths = torch.addmm(pose[:3, 3], means, pose[:3, :3].T).unbind(1)
-    wide, high = (BESIDE * tangent for tangent in camera.tan_half_fov)
-    seen = (depths > NEAR) & (x.abs() < wide * depths) & (y.abs() < high * depths)
+    x, y, depths = camera.local(means).unbind(1)
+    # The rasterizers' limits. Gaussians beyond them would be judged by a camera that they pass by.
+    wide, high = (JACOBIAN_LIMIT * tangent for tangent in camera.tan_half_fov)
+    seen = (depths > NEAR_DEPTH) & (x.abs() < wide * depths) & (y.abs() < high * depths)
     bounds = torch.where(seen, depths * (most / max(camera.fx, camera.fy)), torch.inf).log()
     torch.minimum(log_scales, bounds[:, None], out=log_scales)

@@ -326,7 +326,11 @@ class TrainSettings(HierarchySettings):
         return replace(self, iterations=enough)
 
     def for_size(self, size: tuple[int, int]) -> TrainSettings:
-        """See `HierarchySettings.for_size`: two levels of residuals are split as the strategy says for large images."""
+        """Return settings whose residuals, if they have two levels and no split was given, are split for their images.
+
+        Args:
+            size: (width, height) of the smallest photo.
+        """
         large = self.densification.options.large_split
         if large is None or not is_large(size) or self.split is not None or self.nested or self.levels != 2:
             return self
