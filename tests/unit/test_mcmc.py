@@ -292,7 +292,7 @@ def test_what_a_camera_sees_has_no_standard_deviation_above_the_bound(
 
 @pytest.mark.parametrize(
     ("signed", "size", "bounded"),
-    [(True, (2500, 1000), True), (True, (2499, 1000), False), (False, (2500, 1000), False)],
+    [(True, (1500, 1000), True), (True, (1499, 1000), False), (False, (1500, 1000), False)],
 )
 def test_sizes_are_bounded_in_residuals_of_large_images_alone(
     signed: bool, size: tuple[int, int], bounded: bool, monkeypatch: pytest.MonkeyPatch

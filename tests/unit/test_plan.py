@@ -111,8 +111,8 @@ def test_less_of_a_checkouts_stage_is_joint_where_photos_are_large(
     given: dict[str, Any], small: float, large: float
 ) -> None:
     settings = RunSettings(**given)
-    assert settings.for_size((1920, 1080)).joint_share == settings.joint_share == small
-    assert settings.for_size((2500, 1000)).joint_share == large
+    assert settings.for_size((1280, 1080)).joint_share == settings.joint_share == small
+    assert settings.for_size((1500, 1000)).joint_share == large
 
 
 @pytest.mark.parametrize("levels", range(1, 7))
