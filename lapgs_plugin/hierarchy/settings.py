@@ -31,7 +31,8 @@ coarse level cannot correct errors that the finer level is unable to represent."
 LARGE_IMAGE = 1_500_000
 """Pixels of an image from which on some defaults are others: there a view of a residual takes much longer than one of
 its base. They cost a little quality at half a megapixel and pay at 7 and 13; between, only the bound of sizes was
-measured, on a CPU: it saves 40 % of the time at 1.8. Without it residuals at 2.0 took 14 GB and lost decibels."""
+measured, on a CPU: it saves 40 % of a residual's time at 1.8. Without it residuals at 2.0 took 14 GB and lost decibels.
+"""
 LARGE = f"{LARGE_IMAGE / 1e6:g} megapixels"
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
