@@ -1,6 +1,6 @@
 """Density control as a Markov chain (Kheradmand et al. 2024): move Gaussians that have become transparent, add some up
-to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong, and bounds the sizes of
-residuals on large images.
+to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong, removes transparent
+Gaussians of residuals instead of moving them, and bounds the sizes of residuals on large images.
 
 In plain PyTorch, so that a CPU trains with it as well; gsplat has the same steps for CUDA alone.
 """
@@ -11,6 +11,7 @@ import math
 from functools import lru_cache
 
 import torch
+from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
@@ -30,7 +31,8 @@ START_SCALE, START_OPACITY = 0.1, 0.5
 DEAD_OPACITY = 0.01
 """Gaussians with at most this opacity are moved. MCMC's authors wait until it is half of that."""
 LEAST_OPACITY = 0.005
-"""Opacity of copies, at least."""
+"""Opacity of copies, at least. Gaussians of a residual that are fainter are removed: these are half of all and more
+where a base needs no correction, and as many copies would undo what others have learned since the last refinement."""
 STATISTICS_VIEWS = 40
 """Views before each refinement whose gradients say where Gaussians are needed."""
 MOST_COPIES = 51
@@ -101,7 +103,10 @@ class McmcDensifier(DensityControl):
         if result is not None:
             self.accumulate(result, camera)
         if refines := self._schedule.refines(iteration):
-            self._move_dead(model)
+            if model.signed:
+                self._remove_dead(model)
+            else:
+                self._move_dead(model)
             self._add(model)
             self.state |= {"grad2d": None, "count": None}
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
@@ -123,6 +128,12 @@ class McmcDensifier(DensityControl):
             self._share_gradients(places, chosen)
             # What is moved keeps its moments: it was visible a moment ago, and its first steps would be long without.
             model.overwrite(places, chosen)
+
+    def _remove_dead(self, model: TrainableField) -> None:
+        opacities = torch.sigmoid(model.params["opacities"])
+        faint = opacities < opacities.max().clamp_max(LEAST_OPACITY)  # never all of them
+        if faint.any():
+            remove(model.params, model.optimizers, self.state, faint)
 
     def _add(self, model: TrainableField) -> None:
         grown = max(int(self._growth * len(model)), len(model) + 1)  # 5 % of fewer than 20 Gaussians are none

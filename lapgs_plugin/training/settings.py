@@ -360,9 +360,22 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--views-per-step {views}: expected auto, or at least 1")
         return views
 
-    def strategy_of(self, stage: Stage, pixels: int) -> Strategy:
-        """Return the strategy of density control with the options of a stage and the pixels of its training images."""
-        part = StagePart(self.threshold_factor(stage), pixels, base=self._is_base(stage.level), finest=stage.level == 0)
+    def strategy_of(self, stage: Stage, views: int, pixels: int) -> Strategy:
+        """Return the strategy of density control with the options of a stage.
+
+        Args:
+            stage: of this run's plan.
+            views: number of training views.
+            pixels: of their images of the stage's level together.
+        """
+        part = StagePart(
+            self.threshold_factor(stage),
+            views,
+            pixels,
+            base=self._is_base(stage.level),
+            finest=stage.level == 0,
+            signed=stage.signed,
+        )
         return self.densification.options.of_stage(part)
 
     def sh_rate_factor_of(self, stage: Stage, training_views: int) -> float:

@@ -33,6 +33,10 @@ PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
 """Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
 FEW_PHOTOS = 40
 """Fewer training photos than that leave room for floaters."""
+FREE_VIEWS = 80
+"""Training views from which on MCMC's residuals have less of the weight of the mean opacity, in proportion to 1 /
+views. They start without colour, so that nothing holds their opacities against it, and lose detail; but few views do
+not show which detail is wrong elsewhere."""
 LONG_RUN = 5_000
 """Iterations from which MCMC is better than 3DGS's heuristics: it starts from tiny Gaussians, and short runs end before
 they have grown."""
@@ -44,15 +48,19 @@ class StagePart:
 
     Attributes:
         threshold_factor: on densification thresholds.
+        views: number of training views.
         pixels: of all training images of its level together.
         base: whether it is the coarsest of several levels.
         finest: whether it trains at full size.
+        signed: whether it trains a residual.
     """
 
     threshold_factor: float = 1.0
+    views: int = 1
     pixels: int = 1
     base: bool = False
     finest: bool = True
+    signed: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ class Regularized(Strategy):
     opacity_regularization: float | None = option(
         None,
         "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
-        "with --strategy mcmc, else 0.",
+        f"with --strategy mcmc, {FREE_VIEWS} / views of that in its residual levels of more training views; else 0.",
         panel=PANEL,
         least=0.0,
     )
@@ -259,7 +267,11 @@ class Mcmc(Regularized):
     def of_stage(self, part: StagePart) -> Self:
         own = self.base_cap_max if part.base and self.base_cap_max is not None else self.cap_max
         most = MOST_GAUSSIANS if part.finest else MOST_GAUSSIANS // 2
-        return replace(self, cap_max=own or max(1, min(most, part.pixels // PIXELS_A_GAUSSIAN)))
+        limit = own or max(1, min(most, part.pixels // PIXELS_A_GAUSSIAN))
+        weight = self.opacity_regularization
+        if weight is None and part.signed:
+            weight = self.default_weight * min(1.0, FREE_VIEWS / part.views)
+        return replace(self, cap_max=limit, opacity_regularization=weight)
 
     @property
     def most(self) -> int | None:

@@ -168,8 +168,8 @@ class Trainer:
         return f"density control: --strategy {self.settings.densification.strategy}{words}"
 
     def _strategy_of(self, stage: Stage) -> Strategy:
-        sizes = (level_size(view.camera.size, stage.level) for view in self._context.scene.train)
-        return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
+        sizes = [level_size(view.camera.size, stage.level) for view in self._context.scene.train]
+        return self.settings.strategy_of(stage, len(sizes), sum(map(math.prod, sizes)))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""

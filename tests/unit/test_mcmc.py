@@ -207,6 +207,55 @@ def test_refinement_edits_parameters_and_moments_as_gsplat_does(monkeypatch: pyt
             torch.testing.assert_close(models[0].optimizer_moments()[name][key], moment, msg=f"{name} {key}")
 
 
+@settings(deadline=None, max_examples=40)
+@given(opacities=st.lists(st.floats(0.0, 0.02), min_size=1, max_size=12))
+def test_faint_gaussians_of_a_residual_are_removed_and_the_others_stay(opacities: list[float]) -> None:
+    model = model_of(replace(blob_field(len(opacities)), signed=True))
+    sum(value.square().sum() for value in model.params.values()).backward()  # type: ignore[union-attr]
+    model.step(1e-3)
+    model.params["opacities"].data = torch.logit(torch.tensor(opacities, dtype=torch.float32))
+    reached = torch.sigmoid(model.params["opacities"].detach())
+    alive = ((reached >= 0.005) if (reached >= 0.005).any() else reached == reached.max()).nonzero()[:, 0]
+    before = {name: value.detach().clone() for name, value in model.params.items()}
+    moments = {name: {**each} for name, each in model.optimizer_moments().items()}
+    control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=1))  # none are added
+    control.state |= {"grad2d": torch.arange(len(reached)) + 1.0, "count": torch.arange(len(reached)) + 2}
+    control._remove_dead(model)
+    assert torch.equal(control.state["grad2d"], alive + 1.0)
+    assert torch.equal(control.state["count"], alive + 2)
+    for name, value in before.items():
+        assert torch.equal(model.params[name], value[alive]), name
+        assert model.params[name].requires_grad
+        for key, moment in moments[name].items():
+            assert torch.equal(model.optimizer_moments()[name][key], moment if key == "step" else moment[alive])
+
+
+def test_a_refinement_removes_in_a_residual_alone() -> None:
+    for signed in (False, True):
+        model = model_of(replace(blob_field(10), signed=signed))
+        with torch.no_grad():
+            model.params["opacities"][:4] = -9.0
+        model.optimizers["means"].param_groups[0]["lr"] = 0.0
+        control = McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=10 - 4 * signed))
+        assert control.after_step(model, 20, None, ring_scene().train[0].camera)
+        assert len(model) == 10 - 4 * signed
+        assert (torch.sigmoid(model.params["opacities"]) >= 0.005).all()
+
+
+@pytest.mark.parametrize(
+    ("weight", "views", "expected"),
+    [(None, 80, [0.01, 0.01]), (None, 320, [0.01, 0.0025]), (0.02, 320, [0.02, 0.02]), (0.0, 320, [0.0, 0.0])],
+)
+def test_residuals_of_many_views_weigh_opacities_less(weight: float | None, views: int, expected: list[float]) -> None:
+    options = Mcmc(opacity_regularization=weight)
+    for hierarchy, weights in ((Hierarchy.LAPLACIAN, expected), (Hierarchy.NESTED, [expected[0]] * 2)):
+        chosen = TrainSettings(hierarchy=hierarchy.value, densification=Densification(strategy=MCMC, options=options))
+        stages = StagePlan.create((64, 48), 100, 2, hierarchy=hierarchy)
+        found = [chosen.strategy_of(stage, views, 1000) for stage in stages]
+        assert [each.opacity_weight for each in found if isinstance(each, Mcmc)] == pytest.approx(weights)
+        assert [each.scale_weight for each in found if isinstance(each, Mcmc)] == [0.01, 0.01]
+
+
 def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
     torch.manual_seed(0)
     model = trained_once(200)
@@ -320,7 +369,7 @@ def test_limits_follow_the_pixels_of_a_level() -> None:
     def limits(pixels: tuple[int, int], **options: int) -> list[int | None]:
         chosen = TrainSettings(densification=Densification(strategy=MCMC, options=Mcmc(**options)))
         stages = zip(plan, pixels, strict=True)
-        found = (chosen.strategy_of(stage, count) for stage, count in stages)
+        found = (chosen.strategy_of(stage, 10, count) for stage, count in stages)
         return [each.cap_max for each in found if isinstance(each, Mcmc)]
 
     assert limits((10**9, 10**9)) == [500_000, 1_000_000]
