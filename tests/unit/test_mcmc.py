@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import StagePlan
@@ -29,7 +29,7 @@ from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
-from tests.training_runs import Said, ring_manifest, train
+from tests.training_runs import Said, StopAt, plys, resume, ring_manifest, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
 
@@ -438,6 +438,20 @@ def test_runs_say_their_limits_stay_under_them_and_learn(hierarchy: str, tmp_pat
     assert [record.signed for record in run.manifest.records] == [False, hierarchy == "laplacian"]
     first, last = (run.history()[i]["loss"] for i in (0, -1))
     assert last < first
+
+
+def test_a_residual_that_lost_gaussians_is_resumed_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcmc, "LEAST_OPACITY", 0.3)  # so short a stage makes none fainter than the true one
+    density = Densification(start=3, until=55, every=5, strategy=MCMC, options=Mcmc(cap_max=90, base_cap_max=110))
+    chosen = TrainSettings(iterations=60, sh_degree=1, sh_every=10, split="1/2,1/2", densification=density)
+    whole = train(tmp_path / "whole", ring_scene(), chosen)
+    counts = [line["num_gaussians"] for line in whole.history() if line["level"] == 0]
+    assert min(counts) < 80
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "stopped", ring_scene(), chosen, monitor=StopAt(0, 21))
+    assert plys(resume(tmp_path / "stopped", ring_scene(), chosen)) == plys(whole)
 
 
 def test_a_sparse_step_leaves_out_what_no_view_shows_although_the_loss_has_all_opacities() -> None:
