@@ -1,13 +1,16 @@
 """Damaged files of every kind: a result, or one line that names the file; never a traceback, never much memory.
 
 The short version draws the same cases each time. The long one draws others each time and prints its seed. What fails is
-kept for `python -m tests.fuzz.campaign --replay`.
+kept for `python -m tests.fuzz.campaign --replay`. And the harness finds what it is there to find.
+
+One file, because a file's tests run in one process: another would make the whole files and start a reader again.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 from random import Random
 
 import pytest
@@ -15,8 +18,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.campaign import campaign
-from tests.fuzz.harness import Case, Fuzzer, Kind
-from tests.fuzz.kinds import KINDS
+from tests.fuzz.harness import MOST_SECONDS, MOST_WAITING, Case, Fuzzer, Kind, judged
+from tests.fuzz.kinds import BY_NAME, KINDS
+from tests.fuzz.mutations import as_json, as_namespace, as_toml, damaged_tree
 from tests.fuzz.worker import STOPPED
 
 CASES = 12
@@ -53,3 +57,90 @@ def test_a_long_campaign(fuzzer: Fuzzer) -> None:
     print(f"seed {seed}")
     found = campaign(replace(fuzzer, slow=True), list(KINDS), MANY_CASES, seed)
     assert not found
+
+
+# ----------------------------------------------------------------------------------------------------------- harness
+
+SOON = 0.3
+"""Seconds of patience with a case that hangs."""
+HOW = {
+    "raise": "traceback",
+    "exit": "exit code 1",
+    "abort": "ended the process",
+    "sleep": f"took more than {SOON:g} s",
+    "compute": f"took more than {SOON:g} s",
+    "grow": "more than 1.5 GB",
+    "ask": "more than 1.5 GB",
+    "nameless": "names no file",
+}
+
+
+def misbehaving(how: str) -> Case:
+    kind = Kind("field", "ascii/field.ply", lambda data, random: data, [("misbehave", how)])
+    return Case(kind, b"ply", kind.commands[0])
+
+
+@pytest.mark.parametrize(
+    ("message", "what"),
+    [
+        ("field.ply is\ndamaged", "no single line of text"),
+        ("field.ply \x1b[2J", "no single line of text"),
+        ("", "no single line of text"),
+        ("field.ply " + "x" * 2000, "a line of more than 1500 characters"),
+    ],
+)
+def test_a_message_is_a_line_of_text(message: str, what: str) -> None:
+    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": ""}
+    problem = judged(answer, misbehaving("nothing"), Path("case"), Path("templates"))
+    assert problem is not None
+    assert problem.what == what
+
+
+@pytest.mark.parametrize("how", ["raise", "exit", "nameless"])
+def test_every_broken_rule_is_told(fuzzer: Fuzzer, how: str) -> None:
+    problem = fuzzer.problem(misbehaving(how))
+    assert problem is not None
+    assert problem.what.startswith(HOW[how])
+
+
+def test_a_process_that_ends_hangs_or_grows_is_told_and_started_again(
+    fuzzer: Fuzzer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for how in ("sleep", "compute", "abort", "grow", "ask"):
+        monkeypatch.setattr(fuzzer.reader, "waits", SOON if how == "sleep" else MOST_WAITING)
+        monkeypatch.setattr(fuzzer.reader, "patience", SOON if how == "compute" else MOST_SECONDS)
+        problem = fuzzer.problem(misbehaving(how))
+        assert problem is not None
+        assert problem.what.startswith(HOW[how])
+    assert fuzzer.problem(misbehaving("nothing")) is None
+
+
+def test_what_failed_is_kept_and_can_be_tried_again(fuzzer: Fuzzer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LAPGS_FUZZ_KEEP", str(fuzzer.scratch / "kept"))
+    with pytest.raises(AssertionError, match=r"scale_0[\s\S]*campaign --replay") as caught:
+        fuzzer.require_good(misbehaving("raise"))
+    kept = fuzzer.scratch / "kept" / str(caught.value).rpartition("/")[2]
+    assert kept.read_bytes() == b"ply"
+
+
+def test_the_same_numbers_make_the_same_damage(fuzzer: Fuzzer) -> None:
+    for kind in KINDS:
+        first, second = (fuzzer.draw(kind, Random(5)) for _ in range(2))
+        assert first.command == second.command
+        if kind.name != "store":  # SQLite counts changes
+            assert first.content == second.content
+
+
+@pytest.mark.parametrize("emit", [as_json, as_toml, as_namespace])
+def test_damage_changes_most_trees(emit: object) -> None:
+    tree = {"a": [1, 2, {"b": "text"}], "c": None if emit is as_json else 1.5, "d": {"e": True}}
+    before = str(tree)
+    changed = sum(repr(damaged_tree(tree, Random(seed))) != before for seed in range(200))
+    assert changed > 180
+    assert str(tree) == before
+
+
+def test_every_kind_is_damaged(fuzzer: Fuzzer) -> None:
+    for kind in BY_NAME.values():
+        whole = fuzzer.whole(kind)
+        assert sum(fuzzer.draw(kind, Random(seed)).content != whole for seed in range(4)) >= 2, kind.name
