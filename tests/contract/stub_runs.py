@@ -47,6 +47,9 @@ SCHEDULE += ("--densify_until_iter", 60, "--percent_dense", 0.05)
 SHORT = ("--iterations", 30)
 """Option for stages of 10 and 20 iterations, for what does not depend on their number."""
 
+HALF = ("--iterations", 45)
+"""Option for stages of 15 and 30 iterations, for what needs densification in both."""
+
 WHITE = ("--white_background", "--densify_from_iter", 0)
 """Options for a white background. Over white, checkouts reset opacities at the first iteration that densifies, never if
 that is 0. In so few iterations opacities would not recover before FastGS prunes faint Gaussians."""

@@ -20,6 +20,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
+    HALF,
     ITERATIONS,
     NAMES,
     SHORT,
@@ -151,7 +152,7 @@ def test_score_functions_compare_composed_images(name: str, scene: Path, tmp_pat
     """The function that makes error maps gets the images to check, in both stages."""
     seen: dict[tuple[int, ...], list[float]] = {}
     module, function = {"fastgs": ("fast_utils", "get_loss"), "taming": ("taming_utils", "get_loss_map")}[name]
-    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run") as adapter:
+    with captured(tmp_path, []), loaded(STUBS[name], scene, tmp_path / "run", *HALF) as adapter:
         utils = sys.modules[f"utils.{module}"]
         original = getattr(utils, function)
 
@@ -241,12 +242,12 @@ def test_a_run_stopped_between_stages_goes_on(
 ) -> None:
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt), caplog.at_level("INFO", "lapgs_plugin"):
-        run_residuals(STUBS[name], scene, folder, hooks=(StopAt(0),), joint=0.0)
+        run_residuals(STUBS[name], scene, folder, *SHORT, hooks=(StopAt(0),), joint=0.0)
     assert caplog.messages[-1] == f"stopped; finished levels in {folder}: 1; --resume continues after them"
     stopped = RunArchive.open(folder)
     assert stopped.available_levels == (1,)
     base = stopped.field_path(1).read_bytes()
-    archive, result = run_residuals(STUBS[name], scene, folder, resume=True, joint=0.0)
+    archive, result = run_residuals(STUBS[name], scene, folder, *SHORT, resume=True, joint=0.0)
     assert archive.available_levels == (1, 0)
     assert archive.field_path(1).read_bytes() == base
     assert result.output.count("Number of points at initialisation") == 1, "only the second stage was trained"

@@ -25,7 +25,7 @@ from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
-    ITERATIONS,
+    HALF,
     NAMES,
     SHORT,
     STUBS,
@@ -79,11 +79,11 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 ) -> None:
     """The checkout's own report is about the composed hierarchy of the last iteration."""
     before = FieldsAt(tmp_path / "run")
-    more: tuple[Any, ...] = ("--test_iterations", ITERATIONS) if name != "fastgs" else ()
+    more: tuple[Any, ...] = (*HALF, "--test_iterations", 45) if name != "fastgs" else HALF
     if name == "taming":
         more += (
             "--ho_iteration",
-            40,
+            20,
         )  # afterwards its optimizer has opacities that its model has not
     archive, result = run_residuals(STUBS[name], scene, tmp_path / "run", *more, hooks=(before,), joint=0.3)
     after = archive.field(1).parameters
@@ -261,12 +261,12 @@ def test_a_stop_in_between_leaves_finished_fields_as_they_were(scene: Path, tmp_
 
     class StopLate(StopAt):
         def before_render(self, context: StageContext) -> None:
-            if context.stage.level == 0 and context.iteration == 60:
+            if context.stage.level == 0 and context.iteration == 30:
                 raise KeyboardInterrupt
 
     before = FieldsAt(tmp_path / "run")
     with captured(tmp_path, []), pytest.raises(KeyboardInterrupt):
-        run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", hooks=(before, StopLate(-1)), joint=0.5)
+        run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *HALF, hooks=(before, StopLate(-1)), joint=0.5)
     stopped = RunArchive.open(tmp_path / "run")
     assert stopped.available_levels == (1,)
     for part, value in stopped.field(1).parameters.items():

@@ -16,7 +16,7 @@ from lapgs_plugin.runner.early_visibility import PROJECTED, EarlyVisibility
 from lapgs_plugin.runner.stage_model import StageModel
 from tests.contract.stub_runs import (
     FORKS,
-    ITERATIONS,
+    HALF,
     KINDS,
     SHORT,
     STUBS,
@@ -29,7 +29,7 @@ from tests.contract.stub_runs import (
 @pytest.mark.parametrize(("name", "kind"), STUBS_AND_KINDS)
 def test_adam(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its class on a CPU, where it steps in PyTorch's operations: density control edits its state as PyTorch's."""
-    plain, _ = run_hierarchy(STUBS[name], scene, tmp_path / "plain", hierarchy=kind)
+    plain, _ = run_hierarchy(STUBS[name], scene, tmp_path / "plain", *HALF, hierarchy=kind)
     used: set[type] = set()
     prepare, step = StageModel.prepare_optimizers, TensorwiseAdam.step
 
@@ -46,7 +46,7 @@ def test_adam(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
     monkeypatch.setattr(StageModel, "prepare_optimizers", prepare_and_fuse)
     monkeypatch.setattr(TensorwiseAdam, "step", counted)
-    ours, _ = run_hierarchy(STUBS[name], scene, tmp_path / "ours", hierarchy=kind)
+    ours, _ = run_hierarchy(STUBS[name], scene, tmp_path / "ours", *HALF, hierarchy=kind)
     assert used == {TensorwiseAdam}
     assert composed_psnr(ours) == pytest.approx(composed_psnr(plain), abs=0.2)  # dB; worst seen 0
 
@@ -94,9 +94,9 @@ def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkey
     for on in (True, False):
         late.clear()
         asked.clear()
-        archive, result = run_hierarchy(STUBS[name], scene, tmp_path / str(on), hierarchy=kind, run_ahead=on)
-        assert len(late) == (ITERATIONS if on else 0)
-        assert (len(asked) >= ITERATIONS) == on
+        archive, result = run_hierarchy(STUBS[name], scene, tmp_path / str(on), *HALF, hierarchy=kind, run_ahead=on)
+        assert len(late) == (45 if on else 0)
+        assert (len(asked) >= 45) == on
         fields = [archive.field(level) for level in (1, 0)]
         found.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
     assert found[0][0] == found[1][0]

@@ -32,6 +32,7 @@ from tests.contract.stub_runs import (
     CHECKOUTS,
     KINDS,
     NAMES,
+    SHORT,
     STUBS,
     THIRDS,
     WHITE,
@@ -244,7 +245,7 @@ def test_a_script_that_cannot_start_in_the_middle_says_so(scene: Path, tmp_path:
             drive(adapter, resume=True, **THIRDS)
 
 
-WARMING_UP = "if iteration > 40: gaussians.update_learning_rate(iteration)"
+WARMING_UP = "if iteration > 14: gaussians.update_learning_rate(iteration)"
 """As in RAIN-GS, whose learning rates stay as they are while it warms up."""
 
 
@@ -266,14 +267,14 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(
             contexts.append((context.stage.level, context.iteration))
 
     folder = tmp_path / "run"
-    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, script=script) as adapter:
+    with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, *SHORT, script=script) as adapter:
         if instead == "pass":
             without(adapter.profile.model, "update_learning_rate")
         drive(adapter, hooks=(Noting(),), hierarchy=hierarchy, dry_run=True, **THIRDS)
     archive = RunArchive.open(folder)
     assert [record.image_size for record in archive.manifest.records] == [(32, 24), (64, 48)]
     # A call's first iteration begins with its first step, after its render, for which hooks are called.
-    assert contexts == [*((1, i) for i in range(1, 31)), *((0, i) for i in range(1, 61))]
+    assert contexts == [*((1, i) for i in range(1, 11)), *((0, i) for i in range(1, 21))]
 
 
 @pytest.mark.parametrize("hierarchy", KINDS)

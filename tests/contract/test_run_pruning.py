@@ -18,6 +18,7 @@ from lapgs_plugin.rendering.run import run_scene
 from lapgs_plugin.runner import stage_pruning
 from lapgs_plugin.runner.active_stage import ActiveStage
 from tests.contract.stub_runs import (
+    HALF,
     NAMES,
     STUBS,
     STUBS_AND_KINDS,
@@ -54,10 +55,11 @@ def test_what_is_least_seen_goes(
     monkeypatch.setattr(ActiveStage, "_prune", watched)
     # Once the base is trained with the residual, it counts in the history as well: after the pruning.
     chosen = {"hierarchy": hierarchy, **({"joint": 0.25} if hierarchy == "laplacian" else {})}
-    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", prune=SHARE, **chosen, **THIRDS)
+    more = (*HALF, "--densify_until_iter", 30)
+    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, prune=SHARE, **chosen, **THIRDS)
     assert archive.manifest.complete
-    # Residuals each densify for themselves; one nested field densifies until iteration 60 of the run.
-    expected_at = {1: 20, 0: 40} if hierarchy == "laplacian" else {0: 30}
+    # Residuals each densify for themselves; one nested field densifies until iteration 30 of the run.
+    expected_at = {1: 10, 0: 20} if hierarchy == "laplacian" else {0: 15}
     assert list(fields) == list(expected_at)
     rasterizer = rasterizer_for(archive.manifest, "cpu", archive.manifest.rasterizer).rasterizer
     views = run_scene(archive).train

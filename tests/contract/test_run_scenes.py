@@ -24,7 +24,6 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
     CHECKOUTS,
-    ITERATIONS,
     KINDS,
     NAMES,
     SHORT,
@@ -102,7 +101,7 @@ def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, t
 @pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
 def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_path: Path) -> None:
     """The checkout blends Blender images over the background, and so do we when the run is rendered again."""
-    more = ("--test_iterations", ITERATIONS, *["--white_background"] * white)
+    more = (*SHORT, "--test_iterations", 30, *["--white_background"] * white)
     archive, result = run_residuals(STUBS["taming"], blender, tmp_path / "run", *more)
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]
@@ -171,7 +170,7 @@ def deep(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
-    _, result = run_residuals(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
+    _, result = run_residuals(STUBS["graphdeco"], deep, tmp_path / "run", *SHORT, "--depths", "depths")
     shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
     used = [value > 0 for value in shown]
     assert used[0]
@@ -180,17 +179,17 @@ def test_depths_supervise_the_base_alone(deep: Path, tmp_path: Path) -> None:
 
 
 def test_depths_supervise_every_nested_level(deep: Path, tmp_path: Path) -> None:
-    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", "--depths", "depths")
+    _, result = run_hierarchy(STUBS["graphdeco"], deep, tmp_path / "run", *SHORT, "--depths", "depths")
     shown = [float(value) for value in re.findall(r"Depth Loss=([0-9.]+)", result.progress)]
     assert min(shown) > 0
 
 
 def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> None:
     """The residual saves at its first iteration, before it steps, what the base saves at its last one."""
-    more = ("--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
-    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *more, 30)
+    more = (*SHORT, "--train_test_exp", "--exposure_lr_init", 0.1, "--save_iterations")
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *more, 10)
     base = json.loads(archive.path("level_1", "exposure.json").read_text())
-    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "again", *more, 31) as adapter:
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "again", *more, 11) as adapter:
         at_first: dict[str, Any] = {}
         save = adapter.train.Scene.save
 
@@ -209,7 +208,7 @@ def test_exposures_go_on_from_stage_to_stage(scene: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("hierarchy", KINDS)
 def test_exposures_survive_a_stop(hierarchy: str, scene: Path, tmp_path: Path) -> None:
     """A stopped run continues with the exposures that the base ended with."""
-    more = ("--train_test_exp", "--exposure_lr_init", 0.1)
+    more = (*SHORT, "--train_test_exp", "--exposure_lr_init", 0.1)
     trained: list[Tensor] = []
     started: list[Tensor] = []
 
