@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
@@ -164,6 +163,8 @@ def mean_squared_distance(points: Tensor) -> Tensor:
     count = min(NEIGHBOURS, len(points) - 1)
     if count == 0:
         return torch.zeros_like(points[:, 0])
+    from scipy.spatial import cKDTree  # a tenth of a second, which reading a run's manifest need not wait
+
     positions = points.detach().to("cpu", torch.float64).numpy()
     # The nearest of count + 1 is the point itself or one at the same position: its distance is 0 either way.
     distances, _ = cKDTree(positions).query(positions, k=count + 1, workers=-1)
