@@ -51,7 +51,7 @@ def test_workers_share_the_runs(planned: tuple[ResultStore, list[str]], tmp_path
 def test_a_killed_worker_costs_one_run_its_first_attempt(tmp_path: Path) -> None:
     jobs = copying_jobs(
         tmp_path,
-        4,
+        2,
         seconds=1.0,
         code=COPY.replace(START, START + "import os; open(started + '-pid', 'w').write(str(os.getpid())); "),
     )
