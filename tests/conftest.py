@@ -8,7 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
+
+# Python's default looks for garbage among all that is imported again and again, and there is none. At once, because
+# collecting the tests imports most of it.
+gc.set_threshold(10_000, 20, 20)
 
 SHARED_DATA = Path(os.environ.get("LAPGS_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -24,11 +27,6 @@ def shared_data() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start with tests of pages: a browser that draws in software takes longest beside other processes."""
     items.sort(key=lambda item: item.get_closest_marker("browser") is None)
-
-
-def pytest_collection_finish() -> None:
-    """Look for garbage less often: Python's default looks at all that the tests have imported again and again."""
-    gc.set_threshold(10_000, 20, 20)
 
 
 def pytest_unconfigure() -> None:
@@ -55,5 +53,7 @@ def _garbage_of_a_file() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _seeded_and_in_one_thread() -> None:
     """On tensors this small, a second thread of PyTorch only spins."""
+    import torch  # not with this file, which the process that starts the others reads first
+
     torch.manual_seed(0)
     torch.set_num_threads(1)
