@@ -30,8 +30,7 @@ JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
 coarse level cannot correct errors that the finer level is unable to represent."""
 LARGE_IMAGE = 1_500_000
 """Pixels of an image from which on some defaults are others: there a view of a residual takes much longer than one of
-its base. They cost a little quality at half a megapixel, are neutral at 1.1 and 1.4, and pay from 2 on.
-"""
+its base. They cost a little quality at half a megapixel, are neutral at 1.1 and 1.4, and pay from 2 on."""
 LARGE = f"{LARGE_IMAGE / 1e6:g} megapixels"
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""

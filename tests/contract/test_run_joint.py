@@ -79,7 +79,7 @@ def test_finished_fields_learn_and_the_archive_renders_what_was_reported(
 ) -> None:
     """The checkout's own report is about the composed hierarchy of the last iteration."""
     before = FieldsAt(tmp_path / "run")
-    more: tuple[Any, ...] = (*HALF, "--test_iterations", 45) if name != "fastgs" else HALF
+    more: tuple[Any, ...] = (*HALF, "--test_iterations", HALF[1]) if name != "fastgs" else HALF
     if name == "taming":
         more += (
             "--ho_iteration",

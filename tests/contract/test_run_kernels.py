@@ -95,8 +95,8 @@ def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkey
         late.clear()
         asked.clear()
         archive, result = run_hierarchy(STUBS[name], scene, tmp_path / str(on), *HALF, hierarchy=kind, run_ahead=on)
-        assert len(late) == (45 if on else 0)
-        assert (len(asked) >= 45) == on
+        assert len(late) == (HALF[1] if on else 0)
+        assert (len(asked) >= HALF[1]) == on
         fields = [archive.field(level) for level in (1, 0)]
         found.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
     assert found[0][0] == found[1][0]

@@ -31,6 +31,7 @@ from tests.contract.stub_runs import (
 )
 
 SHARE = 0.05
+DENSE = (*HALF, "--densify_until_iter", 30)
 
 
 @pytest.mark.parametrize(("name", "hierarchy"), STUBS_AND_KINDS)
@@ -55,8 +56,7 @@ def test_what_is_least_seen_goes(
     monkeypatch.setattr(ActiveStage, "_prune", watched)
     # Once the base is trained with the residual, it counts in the history as well: after the pruning.
     chosen = {"hierarchy": hierarchy, **({"joint": 0.25} if hierarchy == "laplacian" else {})}
-    more = (*HALF, "--densify_until_iter", 30)
-    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", *more, prune=SHARE, **chosen, **THIRDS)
+    archive, _ = run_hierarchy(STUBS[name], scene, tmp_path / "run", *DENSE, prune=SHARE, **chosen, **THIRDS)
     assert archive.manifest.complete
     # Residuals each densify for themselves; one nested field densifies until iteration 30 of the run.
     expected_at = {1: 10, 0: 20} if hierarchy == "laplacian" else {0: 15}
@@ -130,9 +130,9 @@ def test_looking_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeyp
         return torch.zeros_like(pixels, dtype=torch.bool)
 
     monkeypatch.setattr(stage_pruning, "least_blended", none)
-    plys, more = [], ("--iterations", 45, "--densify_until_iter", 30)
+    plys = []
     for share in (0.0, SHARE):
-        archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), *more, prune=share, joint=0.25)
+        archive, _ = run_residuals(STUBS[name], scene, tmp_path / str(share), *DENSE, prune=share, joint=0.25)
         plys.append([archive.field_path(level).read_bytes() for level in (1, 0)])
     assert plys[0] == plys[1]
     assert len(calls) == 2

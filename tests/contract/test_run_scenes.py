@@ -101,7 +101,7 @@ def test_a_white_background_lies_behind_the_base_alone(name: str, scene: Path, t
 @pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
 def test_transparent_scenes_render_as_reported(white: bool, blender: Path, tmp_path: Path) -> None:
     """The checkout blends Blender images over the background, and so do we when the run is rendered again."""
-    more = (*SHORT, "--test_iterations", 30, *["--white_background"] * white)
+    more = (*SHORT, "--test_iterations", SHORT[1], *["--white_background"] * white)
     archive, result = run_residuals(STUBS["taming"], blender, tmp_path / "run", *more)
     assert (archive.manifest.scene.kind, archive.manifest.scene.background) == ("transforms", (float(white),) * 3)
     (reported,) = [float(line.split()[-1]) for line in result.lines if "Evaluating test" in line]

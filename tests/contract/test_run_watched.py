@@ -14,10 +14,10 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.watcher import Watcher
-from tests.contract.stub_runs import STUBS, STUBS_AND_KINDS, run_hierarchy
+from tests.contract.stub_runs import HALF, STUBS, STUBS_AND_KINDS, run_hierarchy
 
 EVERY = 4
-SHORT = ("--iterations", 45, "--densify_until_iter", 40)
+SHORT = (*HALF, "--densify_until_iter", 40)
 
 
 class Diary(Watcher):
