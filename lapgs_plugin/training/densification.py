@@ -89,18 +89,24 @@ class DensityControl:
             f"density control {type(self).__qualname__} has no method after_step; it has to edit a field"
         )
 
-    def regularize(self, model: TrainableField, views: int) -> None:
+    def regularize(self, model: TrainableField, iterations: range) -> None:
         """Add the gradients of terms of the loss that depend on the parameters alone, after a step's backward passes.
 
         Here they are those of the mean opacity and the mean size, which make unneeded Gaussians transparent and small.
 
         Args:
             model: whose parameters hold the gradients of the sum of the views' losses.
-            views: number of views of the step; the terms count for each.
+            iterations: of the step, from 1 within the stage, one for each view; the terms count for each.
         """
-        if self._opacity_weight or self._scale_weight:
-            weights = views * self._opacity_weight, views * self._scale_weight
-            add_regularization(model.params["opacities"], model.params["scales"], *weights)
+        weights = self.opacity_weight(model, iterations[-1]), self._scale_weight
+        if any(weights):
+            add_regularization(
+                model.params["opacities"], model.params["scales"], *(len(iterations) * weight for weight in weights)
+            )
+
+    def opacity_weight(self, model: TrainableField, iteration: int) -> float:
+        """Return the weight of the mean opacity of a model in the loss of an iteration."""
+        return self._opacity_weight
 
 
 def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> DensityControl:

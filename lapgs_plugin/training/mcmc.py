@@ -33,6 +33,9 @@ DEAD_OPACITY = 0.01
 LEAST_OPACITY = 0.005
 """Opacity of copies, at least. Gaussians of a residual that are fainter are removed: these are half of all and more
 where a base needs no correction, and as many copies would undo what others have learned since the last refinement."""
+COLORLESS = 0.02
+"""Share of a residual's refinements in which the loss has no mean opacity. Its Gaussians start without colour, so that
+nothing else moves their opacities, and Adam's steps are as long for a small gradient as for a large one."""
 STATISTICS_VIEWS = 40
 """Views before each refinement whose gradients say where Gaussians are needed."""
 MOST_COPIES = 51
@@ -117,6 +120,10 @@ class McmcDensifier(DensityControl):
             if model.signed and is_large(camera.size):
                 bound_sizes(model, camera, MOST_SIGMA)
         return refines
+
+    def opacity_weight(self, model: TrainableField, iteration: int) -> float:
+        learns_colors = model.signed and iteration <= COLORLESS * self._schedule.densify_until
+        return 0.0 if learns_colors else super().opacity_weight(model, iteration)
 
     def _move_dead(self, model: TrainableField) -> None:
         opacities = torch.sigmoid(model.params["opacities"])

@@ -251,7 +251,7 @@ class StageRun:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
         launches = self._run_launches(iterations)
         self.breakdown.mark("backward")
-        self.densifier.regularize(self.model, len(iterations))
+        self.densifier.regularize(self.model, iterations)
         last = iterations[-1]
         for launch in launches:
             self.progress.gaussian_steps += launch.gaussians * launch.views

@@ -131,7 +131,8 @@ class Regularized(Strategy):
     opacity_regularization: float | None = option(
         None,
         "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
-        f"with --strategy mcmc, {FREE_VIEWS} / views of that in its residual levels of more training views; else 0.",
+        f"with --strategy mcmc, {FREE_VIEWS} / views of that in its residual levels of more training views; else 0. "
+        "Residual levels with mcmc leave it out in the first fiftieth of their densification.",
         panel=PANEL,
         least=0.0,
     )

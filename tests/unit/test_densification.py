@@ -85,7 +85,7 @@ def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, o
     (stage,) = StagePlan.create((64, 48), 100, 1)
     control = options.of_stage(StagePart()).density_control(StageSchedule.create(settings, stage), EXTENT)
     model.params["scales"].grad = torch.full((7, 3), 0.25)
-    control.regularize(model, 3)
+    control.regularize(model, range(1, 4))
     gradients = [model.params[name].grad for name in ("opacities", "scales")]
     if opacity == scale == 0.0:
         assert gradients[0] is None

@@ -256,6 +256,23 @@ def test_residuals_of_many_views_weigh_opacities_less(weight: float | None, view
         assert [each.scale_weight for each in found if isinstance(each, Mcmc)] == [0.01, 0.01]
 
 
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize(("iteration", "colorless"), [(1, True), (250, True), (251, False)])
+def test_a_residual_learns_colors_before_its_opacities_have_a_weight(
+    signed: bool, iteration: int, colorless: bool
+) -> None:
+    model = model_of(replace(blob_field(5), signed=signed))
+    schedule = replace(schedule_of(15_000), densify_until=12_500)
+    control = McmcDensifier(schedule, replace(Mcmc(scale_regularization=0.0), cap_max=5))
+    control.regularize(model, range(iteration, iteration + 1))
+    gradient = model.params["opacities"].grad
+    if signed and colorless:
+        assert gradient is None
+    else:
+        assert gradient is not None
+        assert (gradient > 0).all()
+
+
 def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
     torch.manual_seed(0)
     model = trained_once(200)
@@ -461,7 +478,7 @@ def test_a_sparse_step_leaves_out_what_no_view_shows_although_the_loss_has_all_o
     model = model_of(first.with_parameters({"means": means}))
     result = CpuRasterizer()(model.field, scene.train[0].camera, background=torch.zeros(3))
     result.image.square().mean().backward()  # type: ignore[no-untyped-call]  # torch's
-    McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=40)).regularize(model, 1)
+    McmcDensifier(schedule_of(100), replace(Mcmc(), cap_max=40)).regularize(model, range(1, 2))
     assert (model.params["opacities"].grad != 0).all()
     touched = model._touched
     assert touched[:30].any()
