@@ -205,9 +205,11 @@ class ActiveStage:
         self._context.hooks.stage_ends(self.stage)
         gaussians, self.gaussians = self.gaussians, None
         field = self._exported(gaussians, self.stage.signed)
-        self._require_finite(field)
+        joint = None if self._joint is None else self._joint.fields(self._exported)
+        for each in (field, *(joint or {}).values()):
+            self._require_finite(each)
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
-        self.record.archive(result, None if self._joint is None else self._joint.fields(self._exported))
+        self.record.archive(result, joint)
         if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
         self._compare(gaussians, field)

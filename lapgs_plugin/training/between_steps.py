@@ -100,6 +100,7 @@ class BetweenSteps:
         return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
 
     def _save_checkpoint(self, run: StageRun) -> None:
+        run.require_finite(run.progress.iteration)  # Gaussians of NaN are culled: the loss does not show them
         best, overhead = self.evaluation.best, self.evaluation.overhead
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}

@@ -274,7 +274,7 @@ class StageRun:
         self._densify(context, last, launches[-1])
         self.breakdown.mark("other")
         if last % FINITE_CHECK_EVERY < len(iterations) or last == self.stage.iterations:
-            self._require_finite(last)
+            self.require_finite(last)
 
     def _run_launches(self, iterations: range) -> list[_Launch]:
         """Run all launches of a step. If the GPU's memory is too small, start the step again with smaller launches."""
@@ -399,11 +399,14 @@ class StageRun:
             raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
         self.progress.add_loss(loss, views)
 
-    def _require_finite(self, iteration: int) -> None:
-        try:
-            self.model.field.detach().require_finite()
-        except FieldError as error:
-            raise self._diverged(str(error), iteration) from error
+    def require_finite(self, iteration: int) -> None:
+        """Raise a TrainingDivergedError that names an iteration if a field under training has NaN or inf."""
+        for level, field in self.fields.items():
+            try:
+                field.require_finite()
+            except FieldError as error:
+                where = "" if level == self.stage.level else f" of level {level}, trained jointly"
+                raise self._diverged(f"{error}{where}", iteration) from error
 
     def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(

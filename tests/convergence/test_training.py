@@ -9,6 +9,7 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -25,6 +26,7 @@ from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.folders import files_in
@@ -386,6 +388,34 @@ def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, 
     checkpoint = archive.load_checkpoint()
     assert checkpoint is not None
     assert checkpoint["progress"]["iteration"] == 20
+
+
+def test_a_checkpoint_is_kept_that_has_no_nan_although_the_loss_shows_none(scene: Scene, tmp_path: Path) -> None:
+    class Steep(StageHook):
+        def loss(self, context: StageContext, image: torch.Tensor) -> torch.Tensor | None:
+            if (context.stage.level, context.iteration) != (0, 7):
+                return None
+            return (0.0 * image.mean()).sqrt()  # 0, with a gradient of infinity times 0
+
+    with pytest.raises(TrainingDivergedError, match=r"level 0, iteration 9: .*NaN"):
+        train(tmp_path / "run", scene, SETTINGS, user_hooks=[Steep()], checkpoint_every=3)
+    checkpoint = RunArchive.open(tmp_path / "run").load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["progress"]["iteration"] == 6
+
+
+def test_divergence_of_a_field_that_is_trained_jointly_is_named(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = JointFields.step
+
+    def diverge(self: JointFields, *args: Any) -> None:
+        step(self, *args)
+        self.models[1].params["means"].data[0] = math.nan
+
+    monkeypatch.setattr(JointFields, "step", diverge)
+    with pytest.raises(TrainingDivergedError, match=r"level 0, iteration 24: .*NaN.* of level 1, trained jointly"):
+        train(tmp_path / "run", scene, SETTINGS, checkpoint_every=3)
 
 
 def test_a_stop_request_counts_once_and_handlers_are_restored() -> None:
