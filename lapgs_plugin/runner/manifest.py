@@ -89,13 +89,17 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
 
 
 def _identity(manifest: Manifest) -> dict[str, Any]:
-    """Return the values that must stay while a run is continued; the place of images may change, to save memory."""
+    """Return the values that must stay while a run is continued.
+
+    Where images lie, and what makes a loop faster, may change: to save memory, or after a failure.
+    """
     values = asdict(manifest)
     for name in ("records", "created", "created_by"):
         values.pop(name)
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
-    settings.pop("images_on", None)
+    for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim"):
+        settings.pop(name, None)
     # Manifests of earlier versions lack these.
     residuals = Hierarchy.LAPLACIAN.value
     before = {

@@ -373,7 +373,8 @@ def test_out_of_gpu_memory_names_the_stage_and_keeps_the_others(scene: Path, tmp
         assert part in message
     assert RunArchive.open(folder).available_levels == (1,)
     # The message suggests another place for images.
-    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *SHORT, resume=True, images_on="disk")
+    faster = {"run_ahead": False, "fused_adam": False, "fused_ssim": False}
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *SHORT, resume=True, images_on="disk", **faster)
     assert archive.manifest.complete
     assert not archive.path(CACHE).exists()
 
