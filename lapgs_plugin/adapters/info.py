@@ -13,6 +13,9 @@ FAMILY_FILES = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_mod
 FAMILY_EXTENSIONS = {"simple_knn._C": "nearest neighbours", "fused_ssim": "fast SSIM"}
 """Compiled modules besides the rasterizer that training scripts of the family import, each with its purpose."""
 
+RASTER_OPTIONS = {"antialiasing": bool, "kernel_size": float, "mult": float}
+"""Options of the family's scripts that change how a saved field is rendered, with their types."""
+
 
 @dataclass(frozen=True)
 class BackboneInfo:

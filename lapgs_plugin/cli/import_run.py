@@ -31,8 +31,8 @@ def import_run(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="A rasterizer option that FOLDER does not record, if it was not the default: mult=0.7 or "
-            "antialiasing=true. Repeatable.",
+            help="A rasterizer option that FOLDER does not record, if it was not the default: mult=0.7, "
+            "kernel_size=0.3 or antialiasing=true. Repeatable.",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in OUT.")] = False,
@@ -76,5 +76,5 @@ def _parsed(texts: list[str]) -> dict[str, Any]:
         try:
             values[name] = known[value.lower()] if value.lower() in known else float(value)
         except ValueError as error:
-            raise UserInputError(f"--set {text}: expected mult=NUMBER or antialiasing=true|false") from error
+            raise UserInputError(f"--set {text}: expected NAME=NUMBER, true or false, such as mult=0.7") from error
     return values

@@ -11,6 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lapgs_plugin.adapters.info import RASTER_OPTIONS
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
@@ -28,8 +29,6 @@ IMPORTED = "lapgs"
 NEVER = "-1"
 ON_BY_DEFAULT = ("dry-run", "fused-adam", "fused-ssim", "prune-by-size", "run-ahead")
 """Options that --no-NAME switches off."""
-RASTER_OPTIONS = ("mult", "antialiasing")
-"""Options of scripts that change how a saved field is rendered, see `lapgs import-run --set`."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ coefficients are copied unchanged. It clamps each render before composing, on a 
 from __future__ import annotations
 
 import ast
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from typing import Any, Literal
 from typing_extensions import NotRequired
 
 from lapgs_plugin.adapters.base import BackboneAdapter
-from lapgs_plugin.adapters.info import BackboneInfo
+from lapgs_plugin.adapters.info import RASTER_OPTIONS, BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
 from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -204,7 +205,8 @@ def import_run(
         out: run folder to write.
         codebase: name of the backbone that trained it; None for the one that the folder tells.
         scene: new place of the scene; None if it has not moved.
-        settings: settings of its rasterizer that were not the defaults, such as {"mult": 1.0}.
+        settings: settings of its rasterizer that were not the defaults and are not in the folder, such as
+            {"mult": 1.0}.
         overwrite: replace the run in `out`.
 
     Returns:
@@ -223,7 +225,9 @@ def import_run(
         )
     backbone = BACKBONES[name]
     RunArchive.require_room(out, overwrite)
-    manifest = _manifest(run, backbone.info, scene, {**backbone.info.raster_defaults, **_checked(settings or {})})
+    recorded = {name: value for name, value in run.options.items() if _is_raster_option(name, value)}
+    settings = {**backbone.info.raster_defaults, **recorded, **_checked(settings or {})}
+    manifest = _manifest(run, backbone.info, scene, settings)
     scene_options = {"resolution": manifest.scene.resolution, "images": manifest.scene.images}
     with errors_about(run.folder / CFG_ARGS):
         size = smallest_size(manifest.scene.path, **scene_options)
@@ -296,10 +300,19 @@ def _recognised(options: Mapping[str, Any], record: Mapping[str, Any], breakdown
     return next((name for name in told if name in list(BACKBONES)), None)
 
 
+def _is_raster_option(name: str, value: object) -> bool:
+    """Whether it is a setting of rasterizers that changes images, with a value of its type."""
+    kind = RASTER_OPTIONS.get(name)
+    if kind is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return kind is bool and isinstance(value, bool)
+
+
 def _checked(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     for name, value in settings.items():
-        if type(value) not in {"mult": (int, float), "antialiasing": (bool,)}.get(name, ()):
-            raise UserInputError(f"--set {name}={value}: expected mult=NUMBER or antialiasing=true|false")
+        if not _is_raster_option(name, value):
+            forms = [f"{known}={'true|false' if kind is bool else 'NUMBER'}" for known, kind in RASTER_OPTIONS.items()]
+            raise UserInputError(f"--set {name}={value}: expected one of {', '.join(forms)}")
     return settings
 
 

@@ -401,9 +401,9 @@ class StageRun:
 
     def require_finite(self, iteration: int) -> None:
         """Raise a TrainingDivergedError that names an iteration if a field under training has NaN or inf."""
-        for level, field in self.fields.items():
+        for level, trained in self.fields.items():
             try:
-                field.require_finite()
+                trained.require_finite()
             except FieldError as error:
                 where = "" if level == self.stage.level else f" of level {level}, trained jointly"
                 raise self._diverged(f"{error}{where}", iteration) from error
