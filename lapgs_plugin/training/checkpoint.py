@@ -55,7 +55,7 @@ class ModelState(_State):
 
     params: dict[str, Tensor]
     moments: Moments
-    gradients: NotRequired[dict[str, Tensor]]
+    gradients: NotRequired[dict[str, Tensor]]  # empty, of earlier versions
     signed: bool
 
 
@@ -134,9 +134,7 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
     right = state.keys() == fresh.keys()
     for name in fresh if right else ():
         value, first = state[name], fresh[name]
-        if isinstance(first, Tensor):
-            right = right and _is_finite(value, first.shape, first.dtype)
-        elif first is None:
+        if first is None:
             right = right and (value is None or _has_rows(value, count))
         else:
             right = right and type(value) is type(first) and math.isfinite(value)
@@ -223,7 +221,7 @@ def _check_joint(models: Mapping[int, dict[str, Any]], name: str, settings: Trai
 
 
 def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int) -> None:
-    """Check a field with its gradients and Adam's state of it."""
+    """Check a field and Adam's state of it."""
     params = model["params"]
     field = field_from_splats(params, model["signed"])
     shapes = _shapes(field)
@@ -232,12 +230,10 @@ def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int)
             f"{name} is {'a residual' if field.signed else 'no residual'} of SH degree {field.sh_degree}, expected "
             f"{'a residual' if signed else 'none'} of degree {sh_degree}"
         )
-    for kind in ("params", "gradients"):
-        for each, tensor in model.get(kind, {}).items():
-            if each not in params or not _is_finite(tensor, shapes.get(each), torch.float32):
-                raise ValueError(
-                    f"{name}.{kind}.{each} is {_described(tensor)}, expected finite float32 {shapes.get(each)}"
-                )
+    for each, tensor in params.items():
+        if not _is_finite(tensor, shapes.get(each), torch.float32):
+            expected = f"finite float32 {shapes.get(each)}"
+            raise ValueError(f"{name}.params.{each} is {_described(tensor)}, expected {expected}")
     try:
         _check_moments(model["moments"], {each: shapes[each] for each in params})
     except ValueError as error:

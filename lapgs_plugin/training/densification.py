@@ -39,8 +39,8 @@ class DensityControl:
         opacity_weight, scale_weight: of the mean opacity and the mean standard deviation in the loss.
 
     Attributes:
-        state: statistics it keeps between iterations, for checkpoints: numbers, tensors whose shapes stay, or None for
-            what becomes a tensor (n, ...) of one row a Gaussian.
+        state: statistics it keeps between iterations, for checkpoints: numbers, or None for what becomes a tensor
+            (n, ...) of one row a Gaussian, whose rows are edited with the field's.
     """
 
     def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:

@@ -104,7 +104,8 @@ class TrainableField:
         Args:
             means_rate: step size of the positions for one view, already scaled by the extent. The positions' optimizer
                 keeps it, scaled for this step.
-            active_coefficients: SH coefficients in use; higher ones have no gradient and are skipped. None: all.
+            active_coefficients: SH coefficients in use; a CPU skips higher ones, which must never have had a gradient.
+                None: all.
             sh_rest_factor: on the step size of SH above degree 0.
             scale: how the step differs from one for a single view.
         """
@@ -220,15 +221,12 @@ class TrainableField:
         return {
             "params": {name: param.detach() for name, param in self.params.items()},
             "moments": self.optimizer_moments(),
-            "gradients": {name: param.grad for name, param in self.params.items() if param.grad is not None},
             "signed": self.signed,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a result of `state` whose parameters this field was created from."""
         self.adopt_moments(state["moments"], torch.arange(len(self)))
-        for name, gradient in state.get("gradients", {}).items():  # of views since the last step
-            self.params[name].grad = gradient.to(self.params[name].device)
 
 
 def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[str, float]:

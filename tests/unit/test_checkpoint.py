@@ -148,10 +148,6 @@ DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
         r"model\.params\.sh is float32 .*, expected finite",
     ),
     "unsigned": (lambda saved: put(saved, False, "state", "model", "signed"), "model is no residual of SH degree 1"),
-    "a gradient": (
-        lambda saved: put(saved, {"means": torch.zeros(2, 3)}, "state", "model", "gradients"),
-        r"model\.gradients\.means is float32 \(2, 3\)",
-    ),
     "colours of the best state": (
         lambda saved: put(saved, {**BEST, "model": saved["state"]["model"]}, "state", "best"),
         "best.exposure is not the state of transforms for 0 views",
