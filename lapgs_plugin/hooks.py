@@ -21,13 +21,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError, typed_line
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer, render_values
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_depths, render_values
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.supervision import Reconstructed, Supervision
@@ -63,10 +62,7 @@ class FieldInTraining:
 
         Depths are distances along the camera's axis in world units.
         """
-        pose = self.camera.world_to_camera.to(self.gaussians.means)
-        depths = self.gaussians.means @ pose[2, :3] + pose[2, 3]  # (n,)
-        blended, opacity, _ = self.render(torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1))
-        return blended, opacity
+        return render_depths(self.rasterizer, self.gaussians, self.camera)
 
 
 @dataclass(frozen=True)

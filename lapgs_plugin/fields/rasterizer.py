@@ -187,6 +187,17 @@ def render_values(rasterizer: Rasterizer, field: GaussianField, camera: Camera, 
     return rasterizer.render_image(shown, camera, background=torch.zeros(3).to(values), sh_degree=0)
 
 
+def render_depths(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return blended depths and opacity, (height, width) each, differentiable; their quotient is a pixel's mean depth.
+
+    Depths are distances along the camera's axis in world units.
+    """
+    depths = camera.local(field.means)[:, 2]
+    values = torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1)
+    blended, opacity, _ = render_values(rasterizer, field, camera, values)
+    return blended, opacity
+
+
 @torch.no_grad()
 def render_transmittance(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> Tensor:
     """Compute `RenderResult.transmittance` with any rasterizer: render black Gaussians over white."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.rasterizer import Rasterizer
-from lapgs_plugin.fields.spherical_harmonics import SH_C0
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_depths
 
 SMALLEST_COVER = 1e-6
 
@@ -38,13 +37,9 @@ def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -
     """Render the depth of a field from a camera.
 
     Args:
-        rasterizer: any; it renders each Gaussian with its depth as (signed) red, and one as green.
+        rasterizer: any.
         field: ordinary or a base; a residual has no depth.
         camera: on the field's device or the CPU.
     """
-    pose = camera.world_to_camera.to(field.means)
-    along = field.means @ pose[2, :3] + pose[2, 3]  # (n,)
-    colors = torch.stack([along, torch.ones_like(along), torch.zeros_like(along)], dim=1)  # (n, 3)
-    depth_field = replace(field.with_parameters({"sh": colors[:, None] / SH_C0}), signed=True)
-    weighted, cover, _ = rasterizer(depth_field, camera, background=torch.zeros(3).to(field.means), sh_degree=0).image
+    weighted, cover = render_depths(rasterizer, field, camera)
     return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)

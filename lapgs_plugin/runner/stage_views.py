@@ -15,6 +15,7 @@ from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.context import RunContext, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.image_store import chosen_precision
@@ -175,8 +176,4 @@ class StageViews:
 
     def _full_size(self, gaussians: Any, key: str) -> Tensor:
         """Return a view (3, h, w) at full resolution, with finer residuals of zero."""
-        image = self._composed(gaussians, key)
-        for level in range(self._stage.level - 1, -1, -1):
-            width, height = self.size(key, level)
-            image = self._pyramid.up(image, (height, width))
-        return image
+        return to_full_size(self._composed(gaussians, key), self.size(key, 0), self._stage.level, self._pyramid)
