@@ -171,7 +171,7 @@ class StagePlan:
 
         Args:
             image_size: (width, height) of level 0; the smallest if views differ in size.
-            iterations: total optimizer steps, at least one per level.
+            iterations: of all stages, one for each view, at least one a level; a step may take several.
             levels: number of levels L, at least 1.
             split: share of each stage, coarsest first, summing to 1. None takes `DEFAULT_SPLITS`; with more than four
                 levels, the first and last stage get a third each and the others share the rest evenly.

@@ -34,8 +34,9 @@ LEAST_OPACITY = 0.005
 """Opacity of copies, at least. Gaussians of a residual that are fainter are removed: these are half of all and more
 where a base needs no correction, and as many copies would undo what others have learned since the last refinement."""
 COLORLESS = 0.02
-"""Share of a residual's refinements in which the loss has no mean opacity. Its Gaussians start without colour, so that
-nothing else moves their opacities, and Adam's steps are as long for a small gradient as for a large one."""
+"""Share of the iterations up to a residual's last refinement in which the loss has no mean opacity. Gaussians that
+start without colour have no other gradient of their opacities, and Adam's steps are as long for a small one as for a
+large one."""
 STATISTICS_VIEWS = 40
 """Views before each refinement whose gradients say where Gaussians are needed."""
 MOST_COPIES = 51

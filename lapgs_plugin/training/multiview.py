@@ -36,8 +36,8 @@ class ScoredView:
 
     Attributes:
         grey: (3, h, w) image of the field with all colours zero and unclamped, differentiable by its SH coefficients.
-        prediction: (3, h, w) the image that training compares with the target, without gradients.
-        target: (3, h, w).
+        prediction: (3, h, w) composed image, without gradients; hooks do not change it.
+        target: (3, h, w) the photo at the level's size, whatever the supervision.
         loss: scalar, of prediction and target.
     """
 

@@ -72,7 +72,7 @@ def few_views_line(views: int, iterations: int, held_out: bool) -> str | None:
 
 @dataclass
 class QualityWatch:
-    """Compare the measurements of a run with each other.
+    """Compare the measurements of a run with each other, those since it was last resumed.
 
     Attributes:
         best: highest PSNR in dB of the run so far.
