@@ -262,7 +262,10 @@ class StageRun:
         self.breakdown.mark("optimizer")
         means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
-        self.model.step(means_rate, (self.schedule.active_sh_degree(last) + 1) ** 2, rest, scale)
+        # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
+        inherits = self.stage.signed and self.settings.inherit_mode == "full"
+        active = None if inherits else (self.schedule.active_sh_degree(last) + 1) ** 2
+        self.model.step(means_rate, active, rest, scale)
         if self.coarser.joint is not None:
             self.coarser.joint.step(means_rate, rest, scale)
         for learned in filter(None, self.transforms.values()):

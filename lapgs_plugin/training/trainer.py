@@ -113,6 +113,7 @@ class Trainer:
                     "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
                 )
         self._quality = QualityWatch()
+        self._hooks = HookDispatcher.create(self._context.supervision, self.settings.ssim_weight, self.user_hooks)
 
     def run(self, resume: bool = False) -> None:
         """Train all stages that are not finished yet, or extend a finished run.
@@ -286,7 +287,7 @@ class Trainer:
             background=torch.zeros(3, device=self.device) if stage.signed else context.background,
             extent=context.scene.extent,
             rasterizer=self.rasterizer,
-            hooks=HookDispatcher.create(context.supervision, self.settings.ssim_weight, self.user_hooks),
+            hooks=self._hooks,
             model=model,
             densifier=control_of(self._strategy_of(stage), schedule, context.scene.extent),
             coarser=CoarserLevels(images.train_predictions, self.settings.joint_from(stage), unfreeze, breakdown),

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 
+from lapgs_plugin import hooks
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, TrainingStoppedError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.hierarchy.plan import Stage
@@ -388,6 +389,47 @@ def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, 
     checkpoint = archive.load_checkpoint()
     assert checkpoint is not None
     assert checkpoint["progress"]["iteration"] == 20
+
+
+def test_a_hook_by_entry_point_is_one_object_in_all_levels(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[StageHook, int]] = []
+
+    class Noting(StageHook):
+        def on_stage_start(self, stage: Stage) -> None:
+            calls.append((self, stage.level))
+
+    monkeypatch.setattr(hooks, "entry_point_hooks", lambda: (Noting(),))
+    train(tmp_path / "run", scene, replace(SETTINGS, iterations=24))
+    assert [level for _, level in calls] == [1, 0]
+    assert len({id(hook) for hook, _ in calls}) == 1
+
+
+def test_inherited_moments_move_coefficients_above_the_degree_as_adam_does(scene: Scene, tmp_path: Path) -> None:
+    seen: list[torch.Tensor] = []
+    moments: dict[str, torch.Tensor] = {}
+
+    class Watching(StageHook):
+        def on_stage_start(self, stage: Stage) -> None:
+            if stage.level == 0:  # they are in the run folder until the level is finished
+                moments.update(RunArchive.open(tmp_path / "run").optimizer_state(1)["sh"])
+
+        def loss(self, context: StageContext, image: torch.Tensor) -> None:
+            if context.stage.level == 0 and context.iteration <= 2:
+                assert context.field is not None
+                seen.append(context.field.gaussians.sh[:, 1:].detach().double())
+
+    calm = Densification(start=1000, until=1, every=1000, reset_every=1000)
+    settings = replace(SETTINGS, inherit="full", densification=calm, prune=0.0, joint=0.0)
+    archive = train(tmp_path / "run", scene, settings, user_hooks=[Watching()])
+    first, second = (moments[name][:, 1:].double() for name in ("exp_avg", "exp_avg_sq"))
+    step = float(moments["step"]) + 1  # without a gradient
+    root = (0.999 * second / (1 - 0.999**step)).sqrt()
+    rate = archive.manifest.settings["learning_rates"]["residual_sh"] / 20
+    expected = -rate * (0.9 * first / (1 - 0.9**step)) / (root + 1e-15)
+    assert expected.abs().max() > 1e-4
+    torch.testing.assert_close(seen[1] - seen[0], expected, rtol=0.0, atol=1e-8)  # worst seen 1.9e-10
 
 
 def test_a_checkpoint_is_kept_that_has_no_nan_although_the_loss_shows_none(scene: Scene, tmp_path: Path) -> None:
