@@ -98,7 +98,7 @@ class StageSchedule:
         extended = settings.extension_of(stage)
         if extended:
             densify_until = min(densify_until, stage.iterations)
-        # A step ends before a refinement, so that these long ones begin where there is none.
+        # Refinements end a step, so that the long ones begin after the last of them.
         late = max(0, min(round(stage.iterations * LATE_SHARE), stage.iterations - densify_until))
         rates = settings.learning_rates
         return cls(
