@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -206,8 +206,7 @@ class ActiveStage:
         gaussians, self.gaussians = self.gaussians, None
         field = self._exported(gaussians, self.stage.signed)
         joint = None if self._joint is None else self._joint.fields(self._exported)
-        for each in (field, *(joint or {}).values()):
-            self._require_finite(each)
+        self._require_finite({self.stage.level: field, **(joint or {})})
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
         self.record.archive(result, joint)
         if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
@@ -275,16 +274,19 @@ class ActiveStage:
             *(self.stage.level, iteration),
         )
 
-    def _require_finite(self, field: GaussianField) -> None:
-        try:
-            field.require_finite()
-        except FieldError as error:
-            seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
-            raise TrainingDivergedError(
-                f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
-                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
-                "again with lower learning rates, or see whether `lapgs run --off` diverges too"
-            ) from error
+    def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
+        """Raise a TrainingDivergedError if a field, by level, has NaN or inf."""
+        for level, field in fields.items():
+            try:
+                field.require_finite()
+            except FieldError as error:
+                seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
+                where = "" if level == self.stage.level else f" of level {level}, trained jointly"
+                raise TrainingDivergedError(
+                    f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
+                    f"{self.stage.iterations}{seen}: {error}{where}; finished levels ({self._archived_levels()}) are "
+                    "kept, start again with lower learning rates, or see whether `lapgs run --off` diverges too"
+                ) from error
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
         """Return the fields that are being optimized, by level."""
