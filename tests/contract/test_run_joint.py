@@ -336,7 +336,7 @@ def test_nan_in_one_of_them_leaves_all_as_they_were(big: Path, tmp_path: Path, m
         return fields
 
     monkeypatch.setattr(JointLevels, "fields", poisoned)
-    with captured(folder, []), pytest.raises(TrainingDivergedError, match="x is NaN .* of level 1, "):
+    with captured(folder, []), pytest.raises(TrainingDivergedError, match=r"x is NaN .* of level 1, "):
         three_levels(big, folder)
     assert plys(RunArchive.open(folder)) == before
 
