@@ -84,10 +84,21 @@ def adapter_class(folder: Path, name: str | None = None) -> type[BackboneAdapter
     """Return the adapter called `name`, or the one that recognises the checkout whose root is `folder`.
 
     Raises:
-        UserInputError: it is no checkout, or no backbone is called that.
+        UserInputError: it is no checkout, no backbone is called that, or it lacks files that this backbone's have.
     """
+    if name == GENERIC:
+        return GenericAdapter
     if name is not None:
-        return GenericAdapter if name == GENERIC else BACKBONES[name]
+        if name not in list(BACKBONES):
+            raise UserInputError(f"--backbone {name}: expected {', '.join([*BACKBONES, GENERIC])}")
+        chosen = BACKBONES[name]
+        missing = [file for file in chosen.info.own_files if not (folder / file).is_file()]
+        if missing and not chosen.recognises(folder):
+            raise UserInputError(
+                f"--backbone {name}: {folder} has no {missing[0]}, expected a checkout of {chosen.info.title}; leave "
+                f"it out, or take {GENERIC} for any fork"
+            )
+        return chosen
     found = recognise(folder)
     if found is None:
         raise UserInputError(

@@ -50,7 +50,7 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise UserInputError(f"--config {path}: no such file; a run folder has one, {RUN_CONFIG}")
-    known = {str(each.name).replace("_", "-") for each in context.command.params if each.name not in OF_ONE_CALL}
+    known = {str(each.name).replace("_", "-"): each for each in context.command.params if each.name not in OF_ONE_CALL}
     values: dict[str, Any] = {}
     for key, value in read_toml(path, dict[str, Any]).items():
         name = key.replace("-", "_")
@@ -58,10 +58,12 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
             all_of_them = f"{context.command_path} --help lists them"
             raise UserInputError(
                 f"{path}: {key} is not an option of {context.command_path} that a settings file may have; "
-                f"{all_of_them if name in OF_ONE_CALL else nearest(option, known, all_of_them)}"
+                f"{all_of_them if name in OF_ONE_CALL else nearest(option, known.keys(), all_of_them)}"
             )
         if not isinstance(value, str | int | float):
             raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")
+        if isinstance(value, bool) and not getattr(known[option], "is_flag", False):  # Python takes it for a number
+            raise UserInputError(f"{path}: {key} is {json.dumps(value)}, expected a value of --{option}")
         values[name] = value
     return _of_this_version(values)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,10 +77,15 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
             f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
             f"put them back{otherwise}"
         )
-    with errors_about(archive.path(MANIFEST)):
+    with _errors_about_scene(archive, moved_to):
         scene = load_reference(replace(reference, path=str(path)))
     require_same_scene(archive, scene.path, scene.smallest_size)
     return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
+
+
+def _errors_about_scene(archive: RunArchive, moved_to: Path | None) -> AbstractContextManager[None]:
+    """Begin the messages of a block with where the scene's folder is said: in the run, or by the user."""
+    return errors_about(archive.path(MANIFEST) if moved_to is None else "--scene")
 
 
 def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
@@ -108,7 +114,7 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
         As `run_scene`.
     """
     reference, path = _scene_folder(archive, moved_to)
-    with errors_about(archive.path(MANIFEST)):
+    with _errors_about_scene(archive, moved_to):
         train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
     return refined(archive, train), refined(archive, test)

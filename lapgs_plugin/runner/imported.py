@@ -219,10 +219,8 @@ def import_run(
     """
     known, name = list(BACKBONES), codebase or run.codebase
     if name is None or name not in known:
-        raise UserInputError(
-            f"--backbone {name or '(not given)'}: {run.folder} does not say which backbone trained it, expected one of "
-            f"{', '.join(known)}"
-        )
+        untold = f"--backbone (not given): {run.folder} does not say which backbone trained it"
+        raise UserInputError(f"{untold if name is None else f'--backbone {name}'}, expected one of {', '.join(known)}")
     backbone = BACKBONES[name]
     RunArchive.require_room(out, overwrite)
     recorded = {name: value for name, value in run.options.items() if _is_raster_option(name, value)}
@@ -278,10 +276,14 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
     }
     chosen = max(saved, default=None) if iteration is None else iteration
     if chosen is None or chosen not in saved:
-        found = ", ".join(map(str, sorted(saved))) or "none"
+        if not saved:
+            raise RunFolderError(
+                f"{place / 'point_cloud'} holds no iteration_<n>/point_cloud.ply; expected the folder of a finished "
+                "training"
+            )
+        found = ", ".join(map(str, sorted(saved)))
         raise RunFolderError(
-            f"{place / 'point_cloud'} holds fields of iterations {found}, expected "
-            f"{'iteration_<n>/point_cloud.ply' if iteration is None else f'{iteration}'}; choose with --iteration"
+            f"{place / 'point_cloud'} holds fields of iterations {found}, expected {iteration}; choose with --iteration"
         )
     info = place / TRAIN_INFO
     with one_line_errors(info, "read"):

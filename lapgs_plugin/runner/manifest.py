@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,18 @@ from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks
+
+COMPARED_OTHERWISE = {
+    *("-s", "--source_path", "-i", "--images", "-r", "--resolution", "-w", "--white_background"),
+    *("--eval", "--iterations", "--sh_degree"),
+}
+"""Options of a script whose values stand in the manifest by other names."""
+OF_NO_EFFECT = {
+    *("-m", "--model_path", "--ip", "--port", "--quiet", "--disable_viewer", "--websockets", "--data_device"),
+    *("--save_iterations", "--test_iterations", "--checkpoint_iterations", "--benchmark_dir"),
+    *("--debug", "--debug_from", "--detect_anomaly"),
+}
+"""Options of a script that change nothing of what it trains."""
 
 
 def scene_reference(path: Path, dataset: Any, masks: str = "none", holds_out: bool = False) -> SceneReference:
@@ -86,6 +100,30 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
                 f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
                 f"resume with {same}, or start again with --overwrite"
             )
+    typed = [manifest.settings.get("backbone", {}).get("arguments") for manifest in (found, wanted)]
+    if None in typed:
+        return  # by the Python interface
+    first, second = map(_script_options, typed)
+    for name in {**first, **second}:
+        if first.get(name) != second.get(name):
+            was = "without it" if name not in first else f"with {' '.join((name, *first[name]))}"
+            raise RunFolderError(
+                f"{' '.join((name, *second.get(name, ())))}: this run was started {was}; resume with the same options, "
+                "or start again with --overwrite"
+            )
+
+
+def _script_options(arguments: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the options of a script that change what it trains, each with its values as they were typed."""
+    options: dict[str, tuple[str, ...]] = {}
+    name = ""
+    for word in arguments:
+        if re.match(r"--?[A-Za-z]", word):
+            name, equals, value = word.partition("=")
+            options[name] = (value,) if equals else ()
+        else:
+            options[name] = (*options.get(name, ()), word)
+    return {name: values for name, values in options.items() if name not in COMPARED_OTHERWISE | OF_NO_EFFECT}
 
 
 def _identity(manifest: Manifest) -> dict[str, Any]:
@@ -96,6 +134,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     values = asdict(manifest)
     for name in ("records", "created", "created_by"):
         values.pop(name)
+    scene = {f"{name} of the scene": value for name, value in values.pop("scene").items()}
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim"):
@@ -111,4 +150,4 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
         "sh_rate": 1.0,
         "prune_by_size": True,
     }
-    return {**before, **values, **settings, **backbone}
+    return {**before, **scene, **values, **settings, **backbone}

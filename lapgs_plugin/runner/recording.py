@@ -22,9 +22,9 @@ from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.checkouts.viewer_port import sharing_ports
 from lapgs_plugin.checkouts.whole_ply import writing_whole_files
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.files import BARE_RECORD, write_text
+from lapgs_plugin.files import BARE_RECORD, MANIFEST, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
@@ -61,6 +61,7 @@ class BareRunRecorder:
 
         Raises:
             UserInputError: the script never trained.
+            RunFolderError: its output folder holds a run in levels.
         """
         with Attachment(self._replacements()), counting_steps(self._adapter.profile, lambda: self):
             self._adapter.script.run_main()
@@ -88,6 +89,9 @@ class BareRunRecorder:
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def training(*args: Any, **kwargs: Any) -> Any:
             self._call = TrainingCall.bind(original, args, kwargs)
+            folder = self._call.dataset.model_path  # empty: the script makes one
+            if folder and (Path(folder) / MANIFEST).exists():
+                raise RunFolderError(f"-m {folder}: it holds a run in levels; give a bare run another folder")
             self.record = LoopRecord(self._device, self._call.opt.iterations if self._gpu_busy else 0)
             self._timeline = []
             result = original(*args, **kwargs)

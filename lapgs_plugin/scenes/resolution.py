@@ -106,7 +106,7 @@ def parse_size(text: str) -> tuple[int, int]:
     Raises:
         UserInputError: the text has another form.
     """
-    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text.strip().lower())
+    match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text.strip().lower())
     if match is None:
         raise UserInputError(f"--size {text!r}: expected WIDTHxHEIGHT in pixels, such as 480x320")
     return int(match[1]), int(match[2])

@@ -211,6 +211,8 @@ def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> N
         lapgs(command, run, "--scene", tmp_path / "new")
         with pytest.raises(SceneError, match="no such scene folder"):
             lapgs(command, run, "--scene", tmp_path / "nowhere")
+        with pytest.raises(SceneError, match="^--scene: .*neither a COLMAP"):
+            lapgs(command, run, "--scene", tmp_path)
 
 
 @pytest.mark.parametrize("hold_out", [False, True])

@@ -131,6 +131,7 @@ def test_files_of_older_versions_name_strategies_as_they_are_now(
         ("foo = 5", "foo is not an option of .*; .* --help lists them"),
         ('out = "elsewhere"', "out is not an option of .*; .* --help lists them"),
         ("levels = [2]", r"levels is \[2\], expected a string, a number, true or false"),
+        ("levels = true", "levels is true, expected a value of --levels"),
         ('levels = "two"', "--levels two: expected a valid integer"),
         ("levels 2", "is not TOML"),
         ("joint = 2.0", "--joint 2"),

@@ -143,8 +143,11 @@ def test_folders_that_are_no_checkout(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="not a Python script") as caught, loaded_script(tmp_path / "train.py", []):
         pass
     one_line(caught.value)
-    with pytest.raises(UserInputError, match="--backbone nerf: expected") as caught:
+    with pytest.raises(UserInputError, match="--backbone nerf: expected .*, generic$") as caught:
         adapter_class(tmp_path, "nerf")
+    one_line(caught.value)
+    with pytest.raises(UserInputError, match=r"--backbone taming: .* has no utils/taming_utils\.py, expected") as caught:
+        adapter_class(tmp_path, "taming")
     one_line(caught.value)
 
 
@@ -339,8 +342,13 @@ def test_a_run_is_resumed_with_the_same_options_only(scene: Path, tmp_path: Path
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         run_residuals(STUBS["graphdeco"], scene, folder, hooks=(StopAt(0),))
-    for more, options in ((("--iterations", 120), {}), ((), {"inherit": "xyz"}), (("-r", 60), {})):
-        with pytest.raises(RunFolderError, match=r"started with another (iterations|inherit|scene) ") as caught:
+    for more, options, named in (
+        (("--iterations", 120), {}, r"another iterations \("),
+        ((), {"inherit": "xyz"}, r"another inherit \("),
+        (("-r", 60), {}, r"another resolution of the scene \('3dgs:-1', now '3dgs:60'\)"),
+        (("--lambda_dssim", 0.5), {}, "--lambda_dssim 0.5: this run was started without it"),
+    ):
+        with pytest.raises(RunFolderError, match=named) as caught:
             run_residuals(STUBS["graphdeco"], scene, folder, *more, resume=True, **options)
         one_line(caught.value)
 

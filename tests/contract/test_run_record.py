@@ -14,7 +14,7 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from lapgs_plugin.cli.app import app
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.fields.gaussian_field import count_gaussians
 from lapgs_plugin.files import BARE_RECORD
@@ -26,12 +26,14 @@ from tests.contract.stub_runs import (
     ITERATIONS,
     NAMES,
     SAVING,
+    SHORT,
     STUBS,
     Result,
     arguments,
     captured,
     files,
     loaded,
+    run_hierarchy,
     without,
 )
 
@@ -127,6 +129,17 @@ def test_options_that_off_has_no_use_for(scene: Path, tmp_path: Path, given: tup
     assert isinstance(error, UserInputError)
     assert str(error).startswith(f"{named} has no effect with --off")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_bare_run_is_not_recorded_into_a_run_in_levels(scene: Path, tmp_path: Path) -> None:
+    stub, folder = STUBS["fastgs"], tmp_path / "run"
+    run_hierarchy(stub, scene, folder, *SHORT)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    words = ["run", "--off", "--record", "--device", "cpu", str(stub.script)]
+    error = CliRunner().invoke(app, [*words, *arguments(stub, scene, folder, SHORT)]).exception
+    assert isinstance(error, RunFolderError)
+    assert str(error) == f"-m {folder}: it holds a run in levels; give a bare run another folder"
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_record_without_off(scene: Path, tmp_path: Path) -> None:
