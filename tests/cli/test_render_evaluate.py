@@ -211,7 +211,7 @@ def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> N
         lapgs(command, run, "--scene", tmp_path / "new")
         with pytest.raises(SceneError, match="no such scene folder"):
             lapgs(command, run, "--scene", tmp_path / "nowhere")
-        with pytest.raises(SceneError, match="^--scene: .*neither a COLMAP"):
+        with pytest.raises(SceneError, match=r"^--scene: .*neither a COLMAP"):
             lapgs(command, run, "--scene", tmp_path)
 
 
