@@ -160,7 +160,7 @@ def half_written(out: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("delay", [0.0, pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_a_signal_while_a_command_starts(which: signal.Signals, delay: float, scene: Path, tmp_path: Path) -> None:
     ended = signalled(["train", scene, "-o", tmp_path / "run", "--iterations", 4000], [(delay, which)])
     assert ended.code == CODES[which], ended.text
@@ -171,7 +171,7 @@ def test_a_signal_while_a_command_starts(which: signal.Signals, delay: float, sc
 @pytest.mark.parametrize(
     ("name", "which"),
     [
-        ("sample", signal.SIGTERM),
+        pytest.param("sample", signal.SIGTERM, marks=pytest.mark.slow),
         ("render", signal.SIGTERM),
         ("view", signal.SIGTERM),
         pytest.param("view", signal.SIGINT, marks=pytest.mark.slow),

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SMOKE = Path(__file__).parents[2] / "benchmarks" / "smoke.toml"
 
 
@@ -14,6 +16,7 @@ SAMPLE = 'size = "240x160", views = 24, points = 2000'
 SMALLER = 'size = "96x64", views = 9, points = 300'
 
 
+@pytest.mark.slow  # half a minute of starting processes; `make smoke` runs all of it
 def test_the_smoke_experiment_runs_from_end_to_end(tmp_path: Path) -> None:
     """With its first and last variant, on a smaller scene."""
     text, out = SMOKE.read_text(), tmp_path / "smoke"
