@@ -166,7 +166,7 @@ def _write_clip(
         panels=settings.panels,
         image_format=settings.image_format,
     )
-    print(f"{out} holds the clip, {len(cameras)} frame{'' if len(cameras) == 1 else 's'}")
+    print(f"{out} holds the clip, {counted(len(cameras), 'frame')}")
 
 
 def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:

@@ -168,6 +168,21 @@ class GaussianField:
         return field
 
 
+def require_finite(trained: Mapping[int, GaussianField], level: int) -> None:
+    """Check the field of a level in training, and those of others, by level, that are trained jointly with it.
+
+    Raises:
+        FieldError: as of `GaussianField.require_finite`; names the level of another one.
+    """
+    for each, field in trained.items():
+        try:
+            field.require_finite()
+        except FieldError as error:
+            if each == level:
+                raise
+            raise FieldError(f"{error} of level {each}, trained jointly") from error
+
+
 def field_from_splats(splats: Mapping[str, Tensor], signed: bool = False) -> GaussianField:
     """Make a field that shares the tensors of a gsplat trainer, and their gradients.
 

@@ -21,7 +21,7 @@ from lapgs_plugin.errors import (
     first_line,
     typed_line,
 )
-from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
@@ -276,17 +276,15 @@ class ActiveStage:
 
     def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
         """Raise a TrainingDivergedError if a field, by level, has NaN or inf."""
-        for level, field in fields.items():
-            try:
-                field.require_finite()
-            except FieldError as error:
-                seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
-                where = "" if level == self.stage.level else f" of level {level}, trained jointly"
-                raise TrainingDivergedError(
-                    f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
-                    f"{self.stage.iterations}{seen}: {error}{where}; finished levels ({self._archived_levels()}) are "
-                    "kept, start again with lower learning rates, or see whether `lapgs run --off` diverges too"
-                ) from error
+        try:
+            require_finite(fields, self.stage.level)
+        except FieldError as error:
+            seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
+            raise TrainingDivergedError(
+                f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
+                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
+                "again with lower learning rates, or see whether `lapgs run --off` diverges too"
+            ) from error
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
         """Return the fields that are being optimized, by level."""

@@ -274,13 +274,13 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
         for path in (place / "point_cloud").glob("iteration_*/point_cloud.ply")
         if re.fullmatch(r"iteration_0*[1-9][0-9]{0,8}", path.parent.name)
     }
-    chosen = max(saved, default=None) if iteration is None else iteration
-    if chosen is None or chosen not in saved:
-        if not saved:
-            raise RunFolderError(
-                f"{place / 'point_cloud'} holds no iteration_<n>/point_cloud.ply; expected the folder of a finished "
-                "training"
-            )
+    if not saved:
+        raise RunFolderError(
+            f"{place / 'point_cloud'} holds no iteration_<n>/point_cloud.ply; expected the folder of a finished "
+            "training"
+        )
+    chosen = max(saved) if iteration is None else iteration
+    if chosen not in saved:
         found = ", ".join(map(str, sorted(saved)))
         raise RunFolderError(
             f"{place / 'point_cloud'} holds fields of iterations {found}, expected {iteration}; choose with --iteration"

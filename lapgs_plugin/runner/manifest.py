@@ -100,10 +100,9 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
                 f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
                 f"resume with {same}, or start again with --overwrite"
             )
-    typed = [manifest.settings.get("backbone", {}).get("arguments") for manifest in (found, wanted)]
-    if None in typed:
-        return  # by the Python interface
-    first, second = map(_script_options, typed)
+    first, second = (
+        _script_options(manifest.settings.get("backbone", {}).get("arguments", ())) for manifest in (found, wanted)
+    )
     for name in {**first, **second}:
         if first.get(name) != second.get(name):
             was = "without it" if name not in first else f"with {' '.join((name, *first[name]))}"

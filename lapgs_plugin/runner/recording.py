@@ -30,6 +30,7 @@ from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import counting_steps, timing_replacements
+from lapgs_plugin.runs.layout import exists
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +91,7 @@ class BareRunRecorder:
         def training(*args: Any, **kwargs: Any) -> Any:
             self._call = TrainingCall.bind(original, args, kwargs)
             folder = self._call.dataset.model_path  # empty: the script makes one
-            if folder and (Path(folder) / MANIFEST).exists():
+            if folder and exists(Path(folder) / MANIFEST):
                 raise RunFolderError(f"-m {folder}: it holds a run in levels; give a bare run another folder")
             self.record = LoopRecord(self._device, self._call.opt.iterations if self._gpu_busy else 0)
             self._timeline = []

@@ -16,7 +16,7 @@ from torch.autograd.grad_mode import set_multithreading_enabled
 
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
@@ -128,6 +128,8 @@ class StageRun:
 
     def __post_init__(self) -> None:
         self._dropout = self.settings.dropout_for(len(self.views))
+        # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
+        self._inherits_moments = self.stage.signed and self.settings.inherit_mode == "full"
         self._losses = ViewLosses(
             stage=self.stage,
             images=self.images,
@@ -262,9 +264,7 @@ class StageRun:
         self.breakdown.mark("optimizer")
         means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
-        # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
-        inherits = self.stage.signed and self.settings.inherit_mode == "full"
-        active = None if inherits else (self.schedule.active_sh_degree(last) + 1) ** 2
+        active = None if self._inherits_moments else (self.schedule.active_sh_degree(last) + 1) ** 2
         self.model.step(means_rate, active, rest, scale)
         if self.coarser.joint is not None:
             self.coarser.joint.step(means_rate, rest, scale)
@@ -404,12 +404,10 @@ class StageRun:
 
     def require_finite(self, iteration: int) -> None:
         """Raise a TrainingDivergedError that names an iteration if a field under training has NaN or inf."""
-        for level, trained in self.fields.items():
-            try:
-                trained.require_finite()
-            except FieldError as error:
-                where = "" if level == self.stage.level else f" of level {level}, trained jointly"
-                raise self._diverged(f"{error}{where}", iteration) from error
+        try:
+            require_finite(self.fields, self.stage.level)
+        except FieldError as error:
+            raise self._diverged(str(error), iteration) from error
 
     def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(
