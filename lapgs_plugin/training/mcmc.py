@@ -80,7 +80,8 @@ class McmcDensifier(DensityControl):
         assert options.cap_max is not None, "`Mcmc.of_stage` sets it"
         self._schedule, self._most = schedule, options.cap_max
         # The last iteration with noise, and what has come up since; gradients since statistics began, and their views.
-        self.state = {"noised": 0, "variance": 0.0, "grad2d": None, "count": None}
+        # A residual's number of Gaussians when the stage began.
+        self.state = {"noised": 0, "variance": 0.0, "grad2d": None, "count": None, "start": 0}
         times = (schedule.densify_until - schedule.densify_start) // schedule.densify_every
         self._growth = min(max(GROWTH, GROWTH_OF_STAGE ** (1.0 / max(times, 1))), MOST_GROWTH)
 
@@ -123,8 +124,14 @@ class McmcDensifier(DensityControl):
         return refines
 
     def opacity_weight(self, model: TrainableField, iteration: int) -> float:
-        learns_colors = model.signed and iteration <= COLORLESS * self._schedule.densify_until
-        return 0.0 if learns_colors else super().opacity_weight(model, iteration)
+        weight = super().opacity_weight(model, iteration)
+        if not model.signed:
+            return weight
+        self.state["start"] = self.state["start"] or len(model)
+        if iteration <= COLORLESS * self._schedule.densify_until:
+            return 0.0
+        # A mean over fewer Gaussians pulls harder at each: those that removal leaves would follow, to the last one.
+        return weight * min(1.0, len(model) / self.state["start"])
 
     def _move_dead(self, model: TrainableField) -> None:
         opacities = torch.sigmoid(model.params["opacities"])

@@ -132,7 +132,8 @@ class Regularized(Strategy):
         None,
         "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
         f"with --strategy mcmc, {FREE_VIEWS} / views of that in its residual levels of more training views; else 0. "
-        "Residual levels with mcmc leave it out in the first fiftieth of their densification.",
+        "Residual levels with mcmc leave it out in the first fiftieth of their densification, and multiply it by the "
+        "share of their Gaussians that are left.",
         panel=PANEL,
         least=0.0,
     )

@@ -273,6 +273,26 @@ def test_a_residual_learns_colors_before_its_opacities_have_a_weight(
         assert (gradient > 0).all()
 
 
+@pytest.mark.parametrize("signed", [False, True])
+def test_removal_leaves_the_weight_of_the_opacities_that_remain(signed: bool) -> None:
+    """A residual's pull at each opacity stays when others are removed; a base's grows."""
+    model = model_of(replace(blob_field(10), signed=signed))
+    control = McmcDensifier(
+        replace(schedule_of(15_000), densify_until=12_500), replace(Mcmc(scale_regularization=0.0), cap_max=10)
+    )
+
+    def pull(iteration: int) -> float:
+        model.params["opacities"].grad = None
+        control.regularize(model, range(iteration, iteration + 1))
+        gradient = model.params["opacities"].grad
+        assert gradient is not None
+        return float(gradient[-1])
+
+    before = pull(1000)
+    ops.remove(model.params, model.optimizers, {}, torch.arange(10) < 8)
+    assert pull(1001) == pytest.approx(before if signed else 5 * before, rel=1e-6)
+
+
 def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
     torch.manual_seed(0)
     model = trained_once(200)
