@@ -168,7 +168,7 @@ def require_manifest(folder: Path) -> None:
     with one_line_errors(folder, "read"):
         is_run = (folder / MANIFEST).is_file()
     if not is_run:
-        what = f"has no {MANIFEST}" if folder.is_dir() else "does not exist"
+        what = f"has no {MANIFEST}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
         raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
 
 

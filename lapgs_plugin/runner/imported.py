@@ -170,8 +170,9 @@ def read_cfg_args(path: Path) -> dict[str, Any]:
         RunFolderError: it is missing or something else, or lacks an option.
     """
     if not exists(path):
+        what = f"{path.parent} is a file" if path.parent.is_file() else f"{path} does not exist"
         raise RunFolderError(
-            f"{path} does not exist; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
+            f"{what}; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
         )
     text = read_text(path, error=RunFolderError, advice=COPY)
     try:

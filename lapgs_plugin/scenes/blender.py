@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,13 +19,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.errors import SceneError
+from lapgs_plugin.errors import SceneError, counted, printable
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import is_file, is_folder
-from lapgs_plugin.scenes.images import find_image, image_size
+from lapgs_plugin.scenes.images import find_image, image_size, where_else
 from lapgs_plugin.scenes.random_points import CAPTURE_RADIUS, OBJECT_RADIUS, random_points
 from lapgs_plugin.scenes.source import (
+    ALL_AROUND,
     LARGEST,
     PINHOLE_MODELS,
     Frame,
@@ -33,7 +36,7 @@ from lapgs_plugin.scenes.source import (
     in_name_order,
     undistort_hint,
 )
-from lapgs_plugin.untrusted import read_json
+from lapgs_plugin.untrusted import read_json, shortened
 
 SINGLE_FILE = "transforms.json"
 TRAIN_FILE = "transforms_train.json"
@@ -41,11 +44,26 @@ TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """Files of views to hold out: the first that is there."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
-SHORTEST_FOCAL = 1e-3
-"""Shortest focal length in sides of the image."""
+TEST_FRAMES = "test_frames"
+"""Frames to hold out in a file of ScanNet++."""
+SPLITS = ("train", "val", "test")
+"""Parts of a scene for which nerfstudio may list file names."""
+SHORTEST_FOCAL = 0.02
+"""Shortest focal length in sides of the image. Shorter ones are shares of the size rather than pixels."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+FISHEYE = "OPENCV_FISHEYE"
+CAMERA_MODELS = {name.replace("_", ""): name for name in (*PINHOLE_MODELS, FISHEYE, ALL_AROUND)} | {
+    "PERSPECTIVE": "PINHOLE",
+    "SPHERICAL": ALL_AROUND,
+    # COLMAP's others with some or none of the same terms
+    "FISHEYE": FISHEYE,
+    "SIMPLEFISHEYE": FISHEYE,
+    "SIMPLERADIALFISHEYE": FISHEYE,
+    "RADIALFISHEYE": FISHEYE,
+}
+"""COLMAP's camera models by the letters and digits of the names that programs write."""
 POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
@@ -62,55 +80,140 @@ def has_transforms(path: Path) -> bool:
 def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | None = None) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
-    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, else `transforms_val.json`, and a
-    single file those of its lists `test_filenames` and `val_filenames`, or every eighth view.
-    Without it, both files of a pair are trained on, as in 3DGS. If there is no PLY of points (`ply_file_path` or
-    points3d.ply), 100,000 random grey points fill a cube around the point that the cameras look at.
+    With `evaluate`, a pair of files holds out the views of `transforms_test.json`, else `transforms_val.json`. A single
+    file holds out its `test_frames` (ScanNet++) and those of its lists `test_filenames` and `val_filenames`
+    (nerfstudio), or every eighth view. Without it all of these are trained on, as 3DGS does with both files of a pair.
+    Frames marked `is_bad`, and frames in no list of a file that has `train_filenames`, are left out. If there is no PLY
+    of points (`ply_file_path` or points3d.ply), 100,000 random grey points fill a cube around the point that the
+    cameras look at.
 
     Args:
         path: the scene folder.
-        images: folder of the images, replacing the one in `file_path`; "images" keeps it.
+        images: folder of the images, replacing the one in `file_path`; "images" keeps it if it is there.
         evaluate: hold out views.
         lenses: receives those of the frames, whose cameras may be distorted then.
 
     Raises:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
-    if is_file(path / TRAIN_FILE):
-        file, values = TRAIN_FILE, _read_json(path / TRAIN_FILE)
-        train, test = _read_pair(path, values, images, evaluate, lenses)
-        radius = OBJECT_RADIUS
-    else:
-        file, values = SINGLE_FILE, _read_json(path / SINGLE_FILE)
-        frames = _read_frames(path, SINGLE_FILE, values, images, lenses)
-        train, test = hold_out(frames, evaluate, _chosen_for_tests(frames, values))
-        radius = CAPTURE_RADIUS
-    given = _read_points(path, file, values)
-    warnings: tuple[str, ...] = ()
-    if given is None and (named := values.get("ply_file_path")):  # nerfstudio, too, takes random points then
-        warnings = (f"{path / file} names {named}: no such file; training starts from random points",)
-    points, colors = given or random_points([*train, *test], radius)
-    return SceneSource("transforms", train, test, points, colors, warnings)
-
-
-def _read_pair(
-    path: Path, train_values: Values, images: str, evaluate: bool, lenses: Lenses | None
-) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    train = _read_frames(path, TRAIN_FILE, train_values, images, lenses)
-    test: list[Frame] = []
-    if (file := next((name for name in TEST_FILES if is_file(path / name)), None)) is not None:
-        test = _read_frames(path, file, _read_json(path / file), images, lenses)
+    single = not is_file(path / TRAIN_FILE)
+    file = path / (SINGLE_FILE if single else TRAIN_FILE)
+    values, warnings = _read_json(file), list[str]()
+    train, held_out = _read_frames(file, values, images, lenses, warnings), list[Frame]()
+    if single:
+        train, held_out = _split(file, values, train, warnings)
+        if values.get(TEST_FRAMES):
+            held_out += _read_frames(file, values, images, lenses, warnings, TEST_FRAMES)
+    elif (other := next((path / name for name in TEST_FILES if is_file(path / name)), None)) is not None:
+        held_out = _read_frames(other, _read_json(other), images, lenses, warnings)
     elif evaluate:
         raise SceneError(f"{path / TEST_FILES[0]}: no such file, expected the views to hold out; train without --eval")
-    return (in_name_order(train), in_name_order(test)) if evaluate else (in_name_order([*train, *test]), ())
+    parted = _parted(file, train, held_out, evaluate, warnings)
+    points, colors = _read_points(file, values, warnings) or random_points(
+        [*parted[0], *parted[1]], CAPTURE_RADIUS if single else OBJECT_RADIUS
+    )
+    return SceneSource("transforms", *parted, points, colors, tuple(warnings))
 
 
-def _chosen_for_tests(frames: list[Frame], values: Values) -> set[str]:
-    """Return the names of the frames that nerfstudio's lists of file names keep from training."""
-    lists = (values.get(f"{part}_filenames") for part in ("test", "val"))
-    chosen = {PurePosixPath(name) for each in lists if isinstance(each, list) for name in each if isinstance(name, str)}
-    pairs = zip(frames, values["frames"], strict=True)
-    return {frame.name for frame, each in pairs if PurePosixPath(each["file_path"]) in chosen}
+def _parted(
+    file: Path, train: list[Frame], held_out: list[Frame], evaluate: bool, warnings: list[str]
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Return training and held-out frames in name order, each image once."""
+    tests = {frame.path for frame in held_out}
+    unseen = [frame for frame in train if frame.path not in tests]
+    if not evaluate:
+        return in_name_order([*unseen, *held_out]), ()
+    if repeated := len(train) - len(unseen):
+        what = f"{repeated} of {counted(len(train), 'training view')} are test views too: held out, not trained on"
+        if not unseen:  # 3DGS trains on the views that it measures
+            unseen, held_out = held_out, []
+            what = f"all {repeated} training views are test views too: every eighth view is held out instead"
+        warnings.append(f"{file}: {what}")
+    return (in_name_order(unseen), in_name_order(held_out)) if held_out else hold_out(unseen, evaluate)
+
+
+def _split(file: Path, values: Values, frames: list[Frame], warnings: list[str]) -> tuple[list[Frame], list[Frame]]:
+    """Return the frames to train on and those to hold out by nerfstudio's lists of file names, if there are any."""
+    names = [_portable(frame["file_path"]) for frame in values["frames"] if not _is_bad(frame)]
+    train, val, test = (_listed(file, f"{part}_filenames", values, names, warnings) for part in SPLITS)
+    chosen = train or set(range(len(frames))) - val - test
+    if unlisted := len(frames) - len(chosen | val | test):
+        warnings.append(f"{file}: {counted(unlisted, 'frame')} in none of its lists of file names: left out")
+    return [frames[i] for i in sorted(chosen)], [frames[i] for i in sorted(val | test)]
+
+
+def _listed(file: Path, key: str, values: Values, names: Sequence[str], warnings: list[str]) -> set[int]:
+    """Return which of the frames, by their names, a list of file names holds.
+
+    Lists are written by other programs than frames: names may lack folders or their suffix, or be absolute.
+    """
+    entries = values.get(key) or []
+    if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
+        raise SceneError(
+            f"{file}: {key} is {shortened(entries)}, expected a list of file names; export the scene again"
+        )
+    if not entries:
+        return set()
+    by_whole: dict[tuple[str, ...], list[int]] = {}
+    by_end: dict[tuple[str, ...], list[int]] = {}
+    for i, parts in enumerate(map(_name_parts, names)):
+        by_whole.setdefault(parts, []).append(i)
+        for first in range(len(parts)):
+            by_end.setdefault(parts[first:], []).append(i)
+    chosen, unknown = set[int](), list[str]()
+    for entry in entries:
+        parts = _name_parts(_portable(entry))
+        ends = (parts[first:] for first in range(1, len(parts)))
+        alike = by_end.get(parts) or next((by_whole[end] for end in ends if end in by_whole), [])
+        alike = [i for i in alike if PurePosixPath(names[i]) == PurePosixPath(_portable(entry))] or alike
+        if len(several := sorted({names[i] for i in alike})) > 1:
+            raise SceneError(
+                f"{file}: {entry} of {key} may be {several[0]} or {several[1]}, expected the name of one frame; write "
+                "it as its file_path"
+            )
+        chosen.update(alike)
+        unknown += [] if alike else [entry]
+    if unknown and not chosen:
+        raise SceneError(
+            f"{file}: {key} names no frame, the first is {unknown[0]}, expected names as in file_path; correct or "
+            "remove the list"
+        )
+    if unknown:
+        warnings.append(
+            f"{file}: {len(unknown)} of {len(entries)} names of {key} are of no frame and ignored, the first is "
+            f"{printable(unknown[0])}"
+        )
+    return chosen
+
+
+def _name_parts(name: str) -> tuple[str, ...]:
+    """Return the folders and the stem of an image's name, as they are compared with those of another program."""
+    parts = [part.casefold() for part in name.split("/") if part not in ("", ".", "..")] or [""]
+    stem, suffix = os.path.splitext(parts[-1])  # noqa: PTH122
+    return (*parts[:-1], stem if suffix in IMAGE_SUFFIXES else parts[-1])
+
+
+def _portable(name: str) -> str:
+    """Return a file name with the slashes of all systems; programs on Windows write backslashes."""
+    return name.replace("\\", "/")
+
+
+def _is_bad(frame: Any) -> bool:
+    """Return whether ScanNet++ marks a frame as blurred."""
+    return isinstance(frame, dict) and bool(frame.get("is_bad"))
+
+
+def _good_frames(file: Path, values: Values, part: str, warnings: list[str]) -> list[tuple[int, Any]]:
+    """Return the frames that are not marked as blurred, with their numbers in the file."""
+    entries = values[part]
+    if not isinstance(entries, list):
+        raise SceneError(f"{file}: {part} is {shortened(entries)}, expected a list of frames; export the scene again")
+    good = [(index, frame) for index, frame in enumerate(entries) if not _is_bad(frame)]
+    if not good:
+        raise SceneError(f"{file}: all of its {part} are marked is_bad, expected at least one that is not")
+    if bad := len(entries) - len(good):
+        warnings.append(f"{file}: {bad} of {counted(len(entries), 'frame')} marked is_bad: left out")
+    return good
 
 
 def mask_folder(path: Path) -> str | None:
@@ -122,7 +225,7 @@ def mask_folder(path: Path) -> str | None:
     file = next((path / name for name in (TRAIN_FILE, SINGLE_FILE) if is_file(path / name)), None)
     frames = [] if file is None else [frame for frame in _read_json(file)["frames"] if isinstance(frame, dict)]
     masks, photos = (
-        {PurePosixPath(frame[key].replace("\\", "/")).parent for frame in frames if isinstance(frame.get(key), str)}
+        {PurePosixPath(_portable(frame[key])).parent for frame in frames if isinstance(frame.get(key), str)}
         for key in ("mask_path", "file_path")
     )
     if not masks:
@@ -143,13 +246,16 @@ def _read_json(file: Path) -> Values:
     return values
 
 
-def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Lenses | None) -> list[Frame]:
-    frames = []
-    for index, frame in enumerate(values["frames"]):
-        where = f"{path / file}: frame {index}"
+def _read_frames(
+    file: Path, values: Values, images: str, lenses: Lenses | None, warnings: list[str], part: str = "frames"
+) -> list[Frame]:
+    """Return those of the frames that are not marked as bad."""
+    path, frames = file.parent, []
+    for index, frame in _good_frames(file, values, part, warnings):
+        where = f"{file}: {part.removesuffix('s')} {index}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise SceneError(f"{where} has no file_path, expected the name of its image")
-        image = _image_path(path, frame["file_path"], images)
+        image = _image_path(path, _portable(frame["file_path"]), images)
         where = f"{where} ({frame['file_path']})"
         if image.name in ("", "..") or image == Path(os.path.normpath(path)):
             raise SceneError(f"{where} names a folder, expected the name of its image; export the scene again")
@@ -159,11 +265,9 @@ def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Len
         elif is_file(image):
             name = image.name
         else:
-            raise SceneError(
-                f"{where} names {image}: no such image; put it there or choose another folder with --images"
-            )
+            raise SceneError(f"{where} names {image}: no such image; {where_else(path, image.name)}")
         posed = {**values, **frame}
-        lens = _lens(posed)
+        lens = _lens(posed, where)
         if lenses is not None:
             lenses[image] = lens
         elif lens[0] not in PINHOLE_MODELS or lens[1]:
@@ -172,28 +276,41 @@ def _read_frames(path: Path, file: str, values: Values, images: str, lenses: Len
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
         camera = read_camera(posed, where)
-        check_camera(f"{path / file}: the camera of {name}", camera)
+        check_camera(f"{file}: the camera of {name}", camera)
         frames.append(Frame(name, image, camera))
     return frames
 
 
-def _lens(values: Values) -> tuple[str, Values]:
-    """Return the camera model of a frame and its distortion, without zeros."""
+def _lens(values: Values, where: str) -> tuple[str, Values]:
+    """Return the camera model of a frame, by COLMAP's name, and its distortion, without zeros."""
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
     if np.any(values.get("distortion_params") or 0.0):
         distortion["distortion_params"] = values["distortion_params"]
-    return "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model") or "OPENCV", distortion
+    written = values.get("camera_model") or (FISHEYE if values.get("is_fisheye") else "OPENCV")
+    model = CAMERA_MODELS.get(re.sub(r"[\W_]", "", str(written)).upper())
+    if model is None:
+        raise SceneError(
+            f"{where} has the camera_model {shortened(written)}, expected {', '.join(PINHOLE_MODELS)} or {FISHEYE}; "
+            "undistort the photos with the program that wrote it, and export pinhole cameras"
+        )
+    return FISHEYE if values.get("is_fisheye") else model, distortion
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:
-    # instant-ngp writes backslashes on Windows, and ".." where its photos lie beside the scene.
-    image = Path(os.path.normpath(path / file_path.replace("\\", "/")))
+    """Return the image of a frame; where it is missing, the place where it should be."""
+    written, folder = PurePosixPath(file_path), PurePosixPath(images)
+    choices = [written]
     if images != "images":
-        image = path / images / image.name
-    if not image.name:
-        return image
-    candidates = [find_image(image.with_name(image.name + suffix)) for suffix in ("", *IMAGE_SUFFIXES)]
-    return next((candidate for candidate in candidates if is_file(candidate)), image)
+        choices = [folder.joinpath(*written.parts[1:] or written.parts), folder / written.name]
+    elif written.parent == PurePosixPath() or not is_folder(path / written.parent):
+        # Programs write names without their folder, or with that of another machine.
+        choices += [folder / written, folder / written.name]
+    # instant-ngp writes ".." where its photos lie beside the scene.
+    places = [Path(os.path.normpath(path / choice)) for choice in choices]
+    spellings = (
+        image.with_name(image.name + suffix) for image in places if image.name for suffix in ("", *IMAGE_SUFFIXES)
+    )
+    return next((image for image in map(find_image, spellings) if is_file(image)), places[0])
 
 
 def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
@@ -247,17 +364,19 @@ def read_camera(values: Values, where: str) -> Camera:
         raise SceneError(f"{where} has intrinsics that are no numbers ({error}); export it again") from error
     if fx is None or fy is None:
         raise SceneError(f"{where} has neither fl_x nor camera_angle_x, expected one of them; export it again")
-    for axis, focal, side in (("x", fx, width), ("y", fy, height)):
+    for axis in "xy":
         angle = None if f"fl_{axis}" in values else values.get(f"camera_angle_{axis}")
         if angle is not None and float(angle) > math.pi:
             raise SceneError(
                 f"{where} has camera_angle_{axis} {float(angle):g}, expected radians, less than 3.14; export it again"
             )
-        if 0.0 < focal < SHORTEST_FOCAL * side:
-            raise SceneError(
-                f"{where} has a focal length of {focal:g} pixels for {side:.6g} of the image, expected more than a "
-                "thousandth of them; export it again"
-            )
+    least_x, least_y = SHORTEST_FOCAL * width, SHORTEST_FOCAL * height
+    in_corner = abs(cx) <= min(1.0, least_x) and abs(cy) <= min(1.0, least_y)
+    if 0.0 < fx < least_x or 0.0 < fy < least_y or in_corner:
+        raise SceneError(
+            f"{where} has focal lengths {fx:g} and {fy:g} and a principal point ({cx:g}, {cy:g}) for {width:.6g}x"
+            f"{height:.6g}, expected pixels; of shares of the size multiply fl_x and cx by w, fl_y and cy by h"
+        )
     return Camera(width, height, fx, fy, cx, cy, torch.from_numpy(world_to_camera))
 
 
@@ -270,17 +389,23 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
     return None
 
 
-def _read_points(path: Path, transforms: str, values: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return positions and colours (n, 3) of the scene's PLY; None if it has none, or one that is not there."""
-    named = values.get("ply_file_path")
-    if named is not None and not isinstance(named, str):
+def _read_points(
+    transforms: Path, values: Values, warnings: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
+    path, named = transforms.parent, values.get("ply_file_path") or ""
+    if not isinstance(named, str):
         raise SceneError(
-            f"{path / transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
+            f"{transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
         )
-    file = path / named if named else next((path / name for name in POINT_FILES if is_file(path / name)), None)
-    if file is None or not is_file(file):
+    name = PurePosixPath(_portable(named))
+    places = [find_image(path / spelling) for spelling in (name, name.name, *POINT_FILES)]
+    file = next((place for place in places if is_file(place)), None)
+    subject = f"{transforms} names {file}" if file in places[:2] else f"{file}"
+    if named and file not in places[:2]:  # nerfstudio, too, takes random points then
+        warnings.append(f"{transforms} names {named}: no such file; training starts from {file or 'random points'}")
+    if file is None:
         return None
-    subject = f"{path / transforms} names {file}" if named else f"{file}"
     try:
         element = read_ply(file)["vertex"]
     except (OSError, KeyError, ValueError) as error:

@@ -20,7 +20,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
 from lapgs_plugin.scenes.colmap_text import check_text
-from lapgs_plugin.scenes.images import find_image
+from lapgs_plugin.scenes.images import find_image, where_else
 from lapgs_plugin.scenes.random_points import random_points
 from lapgs_plugin.scenes.source import (
     PINHOLE_MODELS,
@@ -84,11 +84,8 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
     folder = path / images
     source = source_of(reconstruction, model, folder)
     if not is_folder(folder):
-        inside = [*sorted(each.name for each in path.iterdir() if each.is_dir()), "."]
-        first = [frame.name for frame in source.train[:1]]
-        others = [each for each in inside for name in first if is_file(find_image(path / each / name))]
-        hint = f"choose {' or '.join(others)} with --images" if others else "put the photos of the model there"
-        raise SceneError(f"{folder}: no such folder of images; {hint}")
+        first = next((frame.name for frame in source.train), "")
+        raise SceneError(f"{folder}: no such folder of images; {where_else(path, first)}")
     train, test = hold_out(source.train, evaluate)
     warnings = source.warnings
     if (larger := largest_model(path, model)) != model:

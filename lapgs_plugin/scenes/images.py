@@ -7,11 +7,13 @@ codebase, and EXR stays linear and unbounded. EXIF orientation is ignored, becau
 from __future__ import annotations
 
 import io
+import logging
 import os
+import re
 import unicodedata
 from collections.abc import Iterator
-from contextlib import suppress
-from functools import lru_cache
+from contextlib import contextmanager, suppress
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,18 +26,24 @@ from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, joined
 from lapgs_plugin.files import is_file, is_folder, refuse_lfs_pointer, whole_file
-from lapgs_plugin.limits import LONGEST_NAME, PHOTO_PIXELS, PHOTO_SIDE
+from lapgs_plugin.limits import LONGEST_NAME
+from lapgs_plugin.scenes.image_files import check_before_decoding, check_size, damaged, reaches_its_end
 
 JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
 """How Pillow writes JPEG files."""
 PNG_LEVEL = 4
 """Faster than zlib's default of 6, for slightly larger files."""
-Image.MAX_IMAGE_PIXELS = PHOTO_PIXELS.value  # Pillow's own limit is below that of phones
+Image.MAX_IMAGE_PIXELS = None  # sizes are checked here; Pillow's own limit is below that of phones, and only warns
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+CUT_SHORT = re.compile("premature end|marker 0xd9 instead", re.IGNORECASE)
+"""Complaints of libjpeg about an image that ends early."""
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+
+logger = logging.getLogger(__name__)
 
 
 def find_image(path: Path) -> Path:
@@ -76,9 +84,11 @@ def _any_format(file: Path) -> str:
     return f"{_plain(file.stem)}.*"
 
 
-def missing_image(path: Path, more: str = "", advice: str = "") -> SceneError:
-    """Return the error for an image that is not there; `more` follows, and `advice` at the end."""
-    return SceneError(f"{path}: no such image{more}; put it there or choose another folder with --images{advice}")
+def where_else(scene: Path, name: str) -> str:
+    """Return what to do about a missing image: choose the folder of the scene that has it, or put the photos there."""
+    inside = [*sorted(folder.name for folder in scene.iterdir() if is_folder(folder)), "."]
+    others = [folder for folder in inside if is_file(find_image(scene / folder / name))]
+    return f"choose {' or '.join(others)} with --images" if others else "put the photos there"
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -114,7 +124,7 @@ def check_image(path: Path) -> tuple[int, int]:
     Raises:
         SceneError: as `read_image`.
     """
-    source = _open(path)
+    source = _open(path, pixels=True)
     size = _image_plane(path, source)
     for _ in _strips(path, source, size, (0.0, 0.0, 0.0)):
         pass
@@ -147,7 +157,7 @@ def read_image(
         SceneError: the file is missing, no image, cut short, holds NaN or inf, or has more pixels than
             `limits.PHOTO_PIXELS`.
     """
-    source = _open(path)
+    source = _open(path, pixels=True)
     full_width, full_height = _image_plane(path, source)
     width, height = size or (full_width, full_height)
     # The filter is separable: first along the rows of each strip, then along columns.
@@ -176,17 +186,34 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     Raises:
         SceneError: the file is missing, no image, cut short, or has more pixels than `limits.PHOTO_PIXELS`.
     """
-    image_size(path)  # checks the limits
-    try:
-        with Image.open(path) as source:
-            source.load()
-            levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
-    except (OSError, SyntaxError, ValueError) as error:  # what Pillow's decoders raise
-        raise SceneError(
-            f"{path}: Pillow, with which 3DGS codebases read images, cannot read it ({joined(error)}); "
-            "expected a whole 8-bit image, copy or convert it again"
-        ) from error
+    image_size(path)  # says what is wrong with damaged files
+    why = "Pillow, with which 3DGS codebases read images, cannot read it, expected a whole 8-bit image"
+    with open_by_pillow(path, why) as source:
+        source.load()
+        levels = np.asarray(_resize_8_bits(source, size, background))[..., :3]  # (h, w, 3)
     return torch.from_numpy(levels.transpose(2, 0, 1).copy()) / 255.0
+
+
+@contextmanager
+def open_by_pillow(path: Path, problem: str) -> Iterator[Image.Image]:
+    """Open an image, which Pillow decodes in the block.
+
+    Args:
+        path: the file.
+        problem: what it means if Pillow cannot decode it, for the message.
+
+    Raises:
+        SceneError: the image is too large, or the block raised an error.
+    """
+    try:
+        with Image.open(path) as image:
+            check_size(path, *image.size)
+            yield image
+    except SceneError:
+        raise
+    except Exception as error:  # of damaged files decoders raise errors of any type
+        reason = joined(str(error) or type(error).__name__)
+        raise SceneError(f"{path}: {problem} ({reason}); copy or convert it again") from error
 
 
 def _resize_8_bits(
@@ -317,17 +344,19 @@ def require_readable(path: Path) -> None:
         raise SceneError(f"{path}: no permission to read it; give this user the permission, or copy the file")
 
 
-def _open(path: Path) -> oiio.ImageInput:
+def _open(path: Path, pixels: bool = False) -> oiio.ImageInput:
+    """Open an image file for its header, or also for its pixels."""
     if (length := len(path.name.encode(errors="surrogatepass"))) > LONGEST_NAME:
         raise SceneError(
             f"{path.parent}: the name of image {path.name[:32]}... has {length} bytes, expected at most "
             f"{LONGEST_NAME}; rename the photo and reconstruct or export again"
         )
     if not is_file(path):
-        raise missing_image(path)
+        raise SceneError(f"{path}: no such image; put it there")
     if str(path).encode(errors="replace").decode() != str(path):
         raise SceneError(f"{path}: its name is not UTF-8; rename it and reconstruct or export again")
     require_readable(path)
+    check_before_decoding(path, whole=pixels)
     options = oiio.ImageSpec()
     # Without it, 8-bit colour is multiplied by alpha in 8 bits, which loses precision where alpha is small.
     options.attribute("oiio:UnassociatedAlpha", 1)
@@ -348,11 +377,7 @@ def _image_plane(path: Path, source: oiio.ImageInput) -> tuple[int, int]:
     stored = (spec.width, spec.height)
     whole = (spec.full_width, spec.full_height) if source.format_name() == "openexr" else stored
     for width, height in (stored, whole):
-        subject = f"{path}: the image is {width}x{height} pixels"
-        if min(width, height) < 1:
-            raise SceneError(f"{subject}, expected at least one; render or export it again")
-        PHOTO_PIXELS.check(width * height, subject, "make it smaller", SceneError)
-        PHOTO_SIDE.check(max(width, height), subject, "make it smaller", SceneError)
+        check_size(path, width, height)
     return whole
 
 
@@ -408,14 +433,31 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
         pixels = source.read_tiles(*window, 0, channels, oiio.FLOAT)
     else:
         pixels = source.read_scanlines(*rows, spec.z, 0, channels, oiio.FLOAT)
-    # A truncated JPEG is decoded to grey; only this message reports it.
     complaint = source.geterror()
-    if pixels is None or complaint:
-        raise SceneError(
-            f"{path}: the image is damaged or cut short ({joined(complaint)}), expected a whole file; copy it again"
-        )
+    if pixels is None or (complaint and source.format_name() != "jpeg"):
+        raise damaged(path, joined(complaint))
+    if complaint:
+        _refuse_cut_jpeg(path, joined(complaint))
     read: NDArray[np.float32] = pixels.reshape(last - first, spec.width, channels)
     return read
+
+
+def _refuse_cut_jpeg(path: Path, complaint: str) -> None:
+    """Refuse a JPEG that ends early, of which the decoder makes the rest grey; log complaints of other damage.
+
+    Only the decoder's first complaint is known. It may be about harmless bytes between segments.
+    """
+    if CUT_SHORT.search(complaint):
+        raise damaged(path, complaint)
+    if not reaches_its_end(path):
+        raise damaged(path, "it has no end")
+    if "extraneous bytes" not in complaint:
+        _log_once(f"{path}: parts of the photo may be wrong ({complaint}); copy it again if they are")
+
+
+@cache  # a photo may be read several times
+def _log_once(line: str) -> None:
+    logger.warning(line)
 
 
 class _Channels(NamedTuple):

@@ -19,7 +19,7 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
-from lapgs_plugin.scenes.images import image_size, missing_image, read_as_3dgs, read_image, same_shape
+from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
     ALPHA,
     AUTO,
@@ -273,10 +273,14 @@ def check_source(path: Path, source: SceneSource) -> None:
     uses = Counter(each for frame in frames for each in (frame.name, frame.path))
     if (double := next((each.name for each in frames if uses[each.name] + uses[each.path] > 2), None)) is not None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
-    if len(missing := [frame.path for frame in frames if not is_file(frame.path)]) > 1:
-        count = f" ({len(missing)} of {len(frames)} are missing)"
-        leave_out = f", or leave them out with `lapgs prepare {quote(str(path))} OUT`"
-        raise missing_image(missing[0], count, leave_out if len(missing) < len(frames) else "")
+    if len(missing := [frame for frame in frames if not is_file(frame.path)]) > 1:
+        some = len(missing) < len(frames)
+        leave_out = f", or leave them out with `lapgs prepare {quote(str(path))} OUT`" if some else ""
+        name = missing[0].name if source.kind == "colmap" else missing[0].path.name
+        raise SceneError(
+            f"{missing[0].path}: no such image ({len(missing)} of {len(frames)} are missing); "
+            f"{where_else(path, name)}{leave_out}"
+        )
     for frame in frames:
         if PurePath(frame.name).is_absolute() or ".." in PurePath(frame.name).parts:
             # because renders are written under these names

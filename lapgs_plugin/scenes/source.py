@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -107,15 +107,9 @@ def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
-def hold_out(
-    frames: Sequence[Frame], evaluate: bool, chosen: Collection[str] = ()
-) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """Return training and held-out frames in name order: every eighth or those named; none unless `evaluate`."""
+def hold_out(frames: Sequence[Frame], evaluate: bool) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Return training and held-out frames in name order: every eighth, or none unless `evaluate`."""
     ordered = in_name_order(frames)
     if not evaluate:
         return ordered, ()
-    names = set(chosen) or {frame.name for frame in ordered[::HOLD_OUT_EVERY]}
-    return (
-        tuple(frame for frame in ordered if frame.name not in names),
-        tuple(frame for frame in ordered if frame.name in names),
-    )
+    return tuple(f for i, f in enumerate(ordered) if i % HOLD_OUT_EVERY), ordered[::HOLD_OUT_EVERY]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pillow_heif
 import pytest
+from PIL import Image
 
 from lapgs_plugin.cli.app import run as command_line
 from lapgs_plugin.cli.evaluate import _print_views
@@ -65,6 +68,31 @@ def test_names_with_escape_sequences(
     change(scene, 3, file_path="\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp")
     line = refused(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run")
     assert r"\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp: no such image" in line
+
+
+def test_damaged_photos_and_a_file_instead_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Libraries print and raise in ways of their own."""
+    pillow_heif.register_heif_opener()
+    scene = write_scene(tmp_path / "scene")
+    photo = scene / "photos" / "03.png"
+    photo.write_bytes(photo.read_bytes()[:-40])
+    assert "photos/03.png: the image is damaged or cut short" in refused(
+        *(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run", "--iterations", 9)
+    )
+    pixels = io.BytesIO()
+    Image.new("RGB", (96, 64)).save(pixels, "HEIF")
+    start = pixels.getvalue().index(b"mdat") + 4
+    (scene / "photos" / "04.heic").write_bytes(pixels.getvalue()[:start] + bytes(9000))
+    assert "04.heic: the photo cannot be decoded" in refused(
+        *(monkeypatch, capfd, "prepare", scene / "photos", tmp_path / "made")
+    )
+    (tmp_path / "scene.ply").write_bytes(b"ply\n")
+    for command in ("view", "render", "import-run"):
+        out = ("-o", tmp_path / "run") if command == "import-run" else ()
+        assert "scene.ply is a file" in refused(monkeypatch, capfd, command, tmp_path / "scene.ply", *out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene", "scene.ply"]
 
 
 def test_a_folder_whose_name_is_not_utf8(

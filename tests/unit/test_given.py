@@ -294,7 +294,7 @@ def _transforms(scene: Path, **changes: Any) -> Path:
             {"file_path": f"images/{name}", "transform_matrix": pose.tolist(), "w": width, "h": height}
             | {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
             | dict(zip(names, distortion.tolist(), strict=True))
-            | {"camera_model": kind if kind == "OPENCV_FISHEYE" else "OPENCV"}
+            | {"camera_model": "fisheye" if kind == "OPENCV_FISHEYE" else "opencv"}
         )
     frames[0] |= changes
     (scene / "transforms.json").write_text(json.dumps({"frames": frames}))

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -332,6 +336,129 @@ def test_progressive_jpeg_cut_short(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-400])
     with pytest.raises(SceneError, match=r"a\.jpg: the image is damaged or cut short"):
         read_image(path)
+
+
+def jpeg(**options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray((smooth(80, 60) * 255).astype(np.uint8)).save(file, "JPEG", quality=90, **options)
+    return file.getvalue()
+
+
+def with_bytes_between(content: bytes, filling: bytes, markers: bytes) -> bytes:
+    """Insert bytes before each of these markers."""
+    return re.sub(rb"(?=\xff[" + re.escape(markers) + rb"])", lambda _: filling, content)
+
+
+TABLES, RESTARTS = b"\xdb\xc4\xc0\xda", bytes(range(0xD0, 0xD8))
+
+
+@pytest.mark.parametrize(
+    ("options", "filling", "markers"),
+    [
+        ({}, b"\0\0", TABLES),
+        ({}, b"\x12\x34\xff\0\x56", TABLES),
+        ({"progressive": True}, b"\0\0", TABLES),
+        ({"restart_marker_rows": 1}, b"", b"\0"),
+        ({"restart_marker_rows": 1}, b"\0\0\0", RESTARTS),
+        ({"restart_marker_blocks": 3}, b"\xff\xff", RESTARTS),
+        ({}, b"\0\0", b"\xd9"),
+    ],
+)
+def test_bytes_between_the_parts_of_a_jpeg(
+    tmp_path: Path, options: dict[str, object], filling: bytes, markers: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Drones write such files, which all decoders show; what follows their end is another image."""
+    path, plain = tmp_path / "a.jpg", jpeg(**options)
+    path.write_bytes(plain)
+    expected = read_image(path)
+    whole = with_bytes_between(plain, filling, markers)
+    path.write_bytes(whole + plain)
+    assert torch.equal(read_image(path), expected)
+    assert check_image(path) == (80, 60)
+    assert not caplog.records
+    for share in (0.3, 0.6, 0.95):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(SceneError, match=r"a\.jpg: (the image is damaged or cut short|not a readable image)"):
+            read_image(path)
+
+
+def test_a_jpeg_that_ends_early_or_holds_wrong_bits(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, content = tmp_path / "a.jpg", jpeg(restart_marker_rows=1)
+    first, second = (found.start() for found in list(re.finditer(rb"\xff[\xd0-\xd7]", content))[:2])
+    for end in (first, first - 20, second + 30):
+        path.write_bytes(content[:end] + b"\xff\xd9")
+        with pytest.raises(SceneError, match=r"a\.jpg: the image is damaged or cut short"):
+            read_image(path)
+    path.write_bytes(content[:first] + content[second:])  # every decoder shows most of it
+    for _ in range(2):
+        assert read_image(path).shape == (3, 60, 80)
+    assert caplog.text.count("a.jpg: parts of the photo may be wrong (JPEG error: ") == 1
+
+
+def png_chunks(content: bytes) -> list[bytes]:
+    chunks, at = [], 8
+    while at < len(content):
+        chunks.append(content[at : at + 12 + int.from_bytes(content[at : at + 4], "big")])
+        at += len(chunks[-1])
+    return chunks
+
+
+def test_a_damaged_png_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """libpng prints a line of its own; chunks that no pixel depends on may be damaged."""
+    path = tmp_path / "a.png"
+    damaged(path, "not")
+    content, whole = path.read_bytes(), read_image(path)
+    header, *others = png_chunks(content)
+    flipped = [bytes([*content[:at], content[at] ^ 4, *content[at + 1 :]]) for at in (8, 13, 18, 25, 31, 40, 60, 9000)]
+    cut = [content[: int(len(content) * share)] for share in (0.0006, 0.001, 0.0015, 0.01, 0.5, 0.99)]
+    for spoilt in (*flipped, *cut, content[:8] + b"".join(others), content[:8] + header + others[-1]):
+        path.write_bytes(spoilt)
+        with pytest.raises(SceneError, match=r"a\.png: (the image is damaged or cut short|not a readable image)"):
+            read_image(path)
+    text = b"\0\0\0\3tEXta\0b????"
+    for harmless in (content[:-12], content + b"more", content[:8] + header + text + b"".join(others)):
+        path.write_bytes(harmless)
+        assert torch.equal(read_image(path), whole)
+    assert capfd.readouterr() == ("", "")
+
+
+def announcing(kind: str, side: int) -> bytes:
+    """A file of noise whose header says side x side pixels."""
+    file = io.BytesIO()
+    options = {"progressive": True} if kind == "JPEG" else {}
+    Image.fromarray((noise(60, 80, 3) * 255).astype(np.uint8)).save(file, kind, **options)
+    content, at = bytearray(file.getvalue()), 0
+    if kind == "JPEG":
+        at = content.index(b"\xff\xc2") + 5
+        content[at : at + 4] = struct.pack(">HH", side, side)
+        content += bytes(3_000_000)  # OpenImageIO refuses sizes that no file of so few bytes has
+    elif kind == "PNG":
+        content[16:24] = struct.pack(">II", side, side)
+        content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    elif kind == "BMP":
+        content[18:26] = struct.pack("<II", side, side)
+    else:
+        at = struct.unpack("<I", content[4:8])[0]
+        for entry in range(at + 2, at + 2 + 12 * struct.unpack("<H", content[at : at + 2])[0], 12):
+            if struct.unpack("<H", content[entry : entry + 2])[0] in (256, 257):  # width and height
+                content[entry + 2 : entry + 12] = struct.pack("<HII", 4, 1, side)
+    return bytes(content)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of memory in KiB")
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "TIFF"])
+def test_sizes_that_no_photo_has_take_no_memory(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"a.{kind.lower()}"
+    path.write_bytes(announcing(kind, 60_000))
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (read_image, image_size, lambda file: read_as_3dgs(file, (8, 6), None)):
+        with pytest.raises(
+            SceneError, match=r"a\.\w+: (the image is 60000x60000 pixels|not a readable image .*claims)"
+        ):
+            read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak < 300_000  # KiB; seen 6,200
 
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:

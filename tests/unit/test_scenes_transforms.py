@@ -148,7 +148,8 @@ def test_zero_distortion_is_no_distortion(tmp_path: Path) -> None:
     path = capture(tmp_path)
     edit(path, {"k1": 0.0, "k2": 0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "is_fisheye": False})
     edit(path, {"camera_model": "SIMPLE_RADIAL", "distortion_params": [0.0] * 6}, in_frame=3)
-    edit(path, {"camera_model": "PINHOLE"}, in_frame=4)
+    for index, name in enumerate(["pinhole", "OpenCV", "simple-pinhole", "Full OpenCV", "perspective", ""]):
+        edit(path, {"camera_model": name}, in_frame=4 + index)
     assert len(load(path).train) == 10
 
 
@@ -183,14 +184,89 @@ def test_single_file_holds_out_every_eighth(tmp_path: Path) -> None:
     assert scene.extent == pytest.approx(1.1 * radius, rel=1e-9)  # 1.9e-16 seen
 
 
-@pytest.mark.parametrize("part", ["test", "val"])
-def test_nerfstudios_lists_choose_the_views_that_are_held_out(tmp_path: Path, part: str) -> None:
-    path = capture(tmp_path)
-    edit(path, {f"{part}_filenames": ["./images/frame_002.png", "images/frame_003.png", "images/none.png"]})
+def held_out(path: Path) -> list[str]:
     scene = load(path, eval=True)
-    assert [view.name for view in scene.test] == ["images/frame_002.png", "images/frame_003.png"]
-    assert len(scene.train) == 8
+    assert not {view.name for view in scene.train} & {view.name for view in scene.test}
+    return [view.name for view in scene.test]
+
+
+HELD_OUT = ["images/frame_002.png", "images/frame_003.png"]
+
+
+@pytest.mark.parametrize("part", ["test", "val"])
+@pytest.mark.parametrize(
+    "spelling",
+    ["./images/{}.png", "{}.png", "{}", "images\\{}.png", "D:\\my scene\\images\\{}.PNG", "/elsewhere/images/{}"],
+)
+def test_lists_choose_the_views_that_are_held_out(tmp_path: Path, part: str, spelling: str) -> None:
+    path = capture(tmp_path)
+    edit(path, {f"{part}_filenames": [spelling.format(f"frame_00{i}") for i in (3, 2)]})
+    assert held_out(path) == HELD_OUT
+    assert len(load(path, eval=True).train) == 8
     assert len(load(path).train) == 10
+
+
+def test_views_in_none_of_the_lists_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = capture(tmp_path)
+    names = [f"frame_{i:03d}.png" for i in range(10)]
+    edit(path, {"train_filenames": names[4:9], "val_filenames": names[2:4], "test_filenames": [names[3]]})
+    assert held_out(path) == HELD_OUT
+    assert [view.name for view in load(path, eval=True).train] == [f"images/{name}" for name in names[4:9]]
+    assert len(load(path).train) == 7
+    assert "3 frames in none of its lists of file names: left out" in caplog.text
+    edit(path, {"val_filenames": None, "test_filenames": None, "train_filenames": names})
+    assert held_out(path) == ["images/frame_000.png", "images/frame_008.png"]
+
+
+def test_names_of_no_frame(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = capture(tmp_path)
+    edit(path, {"test_filenames": ["images/frame_002.png", "images/frame_003.png", "images/none.png"]})
+    assert held_out(path) == HELD_OUT
+    assert "1 of 3 names of test_filenames are of no frame and ignored, the first is images/none.png" in caplog.text
+    edit(path, {"file_path": "images/left/frame_002"}, in_frame=5)
+    for names, message in (
+        (["other/frame_002.png", ""], "test_filenames names no frame, the first is other/frame_002.png"),
+        (["frame_002"], r"frame_002 of test_filenames may be images/frame_002.png or images/left/frame_002, expected"),
+        ("test.txt", "test_filenames is 'test.txt', expected a list of file names"),
+        ([2], r"test_filenames is \[2\], expected a list"),
+    ):
+        edit(path, {"test_filenames": names})
+        refused(path, message)
+
+
+def test_views_listed_as_training_and_test_views(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A list or a test file may repeat training views, or all of them: 3DGS trains on these scenes."""
+    lists = capture(tmp_path / "lists")
+    edit(
+        lists, {"train_filenames": [f"frame_{i:03d}" for i in range(10)], "test_filenames": ["frame_002", "frame_003"]}
+    )
+    assert held_out(lists) == HELD_OUT
+    pair = nerf_scene(tmp_path / "pair", train=9, test=1)
+    train = json.loads((pair / "transforms_train.json").read_text())
+    write_json(pair / "transforms_test.json", train["frames"][2:4], camera_angle_x=FOV)
+    assert held_out(pair) == ["train/r_2.png", "train/r_3.png"]
+    assert len(load(pair).train) == 9
+    assert "2 of 9 training views are test views too: held out, not trained on" in caplog.text
+    write_json(pair / "transforms_test.json", train["frames"], camera_angle_x=FOV)
+    assert held_out(pair) == ["train/r_0.png", "train/r_8.png"]
+    assert "all 9 training views are test views too: every eighth view is held out instead" in caplog.text
+
+
+def test_scannets_test_frames_and_bad_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = capture(tmp_path)
+    frames = json.loads((path / "transforms.json").read_text())["frames"]
+    frames = [{**values, "is_bad": i in (1, 9)} for i, values in enumerate(frames)]
+    edit(path, {"frames": frames[:8], "test_frames": frames[8:]})
+    assert held_out(path) == ["images/frame_008.png"]
+    assert [view.name for view in load(path, eval=True).train] == [
+        f"images/frame_00{i}.png" for i in (0, 2, 3, 4, 5, 6, 7)
+    ]
+    assert len(load(path).train) == 8
+    assert "1 of 8 frames marked is_bad: left out" in caplog.text
+    edit(path, {"frames": [{**frame, "is_bad": True} for frame in frames]})
+    refused(path, "all of its frames are marked is_bad")
+    edit(path, {"frames": frames[:8], "test_frames": {"frame": frames[8]}})
+    refused(path, "test_frames is .* expected a list of frames", eval=True)
 
 
 def test_nerfstudios_masks_are_used(tmp_path: Path) -> None:
@@ -238,6 +314,25 @@ def test_ways_to_write_a_path(tmp_path: Path, name: str) -> None:
     assert load(path).train[0].name == "images/frame_000.png"
 
 
+@pytest.mark.parametrize("name", ["{}", "C:\\Users\\me\\scene\\images\\{}", "/home/other/scene/images/{}", "left/{}"])
+@pytest.mark.parametrize("folder", ["images", "images/left", "photos"])
+def test_names_without_the_folder_of_the_photos(tmp_path: Path, name: str, folder: str) -> None:
+    """The line that refuses a scene names the folder that --images takes."""
+    path = capture(tmp_path)
+    (path / "images").rename(path / "all")
+    (path / folder).parent.mkdir(exist_ok=True)
+    (path / "all").rename(path / folder)
+    for index in range(10):
+        edit(path, {"file_path": name.format(f"frame_{index:03d}.png")}, in_frame=index)
+    if folder == "images/left" and name != "left/{}":
+        refused(path, "frame_000.png: no such image.*; put the photos there")
+        return
+    if folder == "photos":
+        refused(path, "frame_000.png: no such image.*; choose photos with --images")
+    images = "photos" if folder == "photos" else "images"
+    assert [view.name for view in load(path, images=images).train] == [f"{folder}/frame_{i:03d}.png" for i in range(10)]
+
+
 def test_photos_beside_the_scene(tmp_path: Path) -> None:
     path = capture(tmp_path / "scene")
     write_images(tmp_path, ["photos/a.png"], (80, 60))
@@ -257,14 +352,24 @@ def write_ply(file: Path, points: NDArray[np.float64], colors: NDArray[np.generi
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(file))
 
 
-@pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply"])
-def test_points_of_a_ply(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("points3d.ply", None),
+        ("points3d.ply", "none.ply"),
+        ("sparse_pc.ply", "sparse_pc.ply"),
+        ("Points.PLY", "./points.ply"),
+        ("points/sparse.ply", "points\\sparse.ply"),
+        ("sparse.ply", "C:\\scene\\sparse.ply"),
+    ],
+)
+def test_points_of_a_ply(tmp_path: Path, name: str, named: str | None) -> None:
     path = capture(tmp_path)
     points = np.random.default_rng(0).normal(size=(20, 3))
     colors = np.random.default_rng(1).integers(0, 256, (20, 3)).astype(np.uint8)
+    (path / name).parent.mkdir(exist_ok=True)
     write_ply(path / name, points, colors)
-    if name == "sparse_pc.ply":
-        edit(path, {"ply_file_path": name})
+    edit(path, {"ply_file_path": named})
     scene = load(path)
     np.testing.assert_allclose(scene.points.numpy(), points, atol=1e-6)  # 5.5e-8 seen
     np.testing.assert_allclose(scene.colors.numpy(), colors / 255, atol=1e-7)  # 3.0e-8 seen
@@ -339,7 +444,25 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ({"is_fisheye": True}, r"distorted camera \(OPENCV_FISHEYE\).*`lapgs prepare"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 0}, "intrinsics that are no numbers"),
-        ({"fl_x": None, "fl_y": None, "camera_angle_x": np.pi}, "focal length of .* expected more than a thousandth"),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": np.pi}, r"focal lengths 2\.4\d*e-15 and .* expected pixels"),
+        (
+            {"fl_x": 0.875, "fl_y": 1.2, "cx": 0.5, "cy": 0.5},
+            r"focal lengths 0.875 and 1.2 and a principal point \(0.5, 0.5\) for 80x60, expected pixels; .*multiply",
+        ),
+        ({"fl_x": 0.875, "fl_y": None}, r"focal lengths 0.875 and 0.875 .* expected pixels"),
+        ({"cx": 0.5, "cy": 0.5}, r"principal point \(0.5, 0.5\) for 80x60, expected pixels"),
+        ({"cx": 0, "cy": 0}, r"principal point \(0, 0\) for 80x60, expected pixels"),
+        ({"camera_model": "fisheye"}, r"distorted camera \(OPENCV_FISHEYE\).*`lapgs prepare"),
+        (
+            {"camera_model": "radial-fisheye", "k1": 0.1},
+            r"distorted camera \(OPENCV_FISHEYE, k1 = 0.1\).*`lapgs prepare",
+        ),
+        ({"camera_model": "equirectangular"}, r"distorted camera \(EQUIRECTANGULAR\); it sees all around"),
+        (
+            {"camera_model": "FISHEYE624"},
+            "has the camera_model 'FISHEYE624', expected SIMPLE_PINHOLE, .* or OPENCV_FISHEYE",
+        ),
+        ({"camera_model": ["PINHOLE"] * 99}, r"has the camera_model \['PINHOLE', .*\], expected"),
         ({"w": 1e400}, "intrinsics that are no numbers"),
         ({"ply_file_path": 5}, "ply_file_path is 5, expected the name of a file"),
         ({"fl_x": "wide"}, "intrinsics that are no numbers"),
@@ -361,13 +484,22 @@ def refused(path: Path, message: str, **options: Any) -> None:
         ),
         ({"w": 10**300}, "holds the number of 997 bits, expected 64 bits at most"),
         ({"w": 10**4000}, "holds the number of 13288 bits, expected 64 bits at most"),
-        ({"camera_model": "\x1b[2J\n"}, r"distorted camera \(\\x1b\[2J\\n\)"),
+        ({"camera_model": "\x1b[2J\n"}, r"has the camera_model '\\x1b\[2J\\n', expected"),
     ],
 )
 def test_wrong_values_of_the_file(tmp_path: Path, change: dict[str, object], message: str) -> None:
     path = capture(tmp_path)
     edit(path, change)
     refused(path, message)
+
+
+def test_shares_of_the_size_are_pixels_once_multiplied_as_advised(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    edit(path, {"fl_x": 0.875, "fl_y": 1.2, "cx": 0.5125, "cy": 0.4875})
+    refused(path, "multiply fl_x and cx by w, fl_y and cy by h")
+    edit(path, {"fl_x": 0.875 * 80, "fl_y": 1.2 * 60, "cx": 0.5125 * 80, "cy": 0.4875 * 60})
+    camera = load(path).train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((70, 72, 41, 29.25))
 
 
 def placed(x: float) -> list[list[float]]:

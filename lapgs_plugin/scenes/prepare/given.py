@@ -14,7 +14,7 @@ import pycolmap
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
-from lapgs_plugin.scenes.blender import Lenses, has_transforms, read_transforms
+from lapgs_plugin.scenes.blender import FISHEYE, Lenses, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, largest_model, read_model, source_of
 from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
@@ -28,7 +28,7 @@ FOLDERS = (".", "images", "input")
 USED = ("max_size", "masks", "model")
 """Settings that concern undistortion."""
 OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3")
-FISHEYE, FISHEYE_TERMS = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")
+FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
 """Distortion in transforms files. nerfstudio's k4 of other lenses is not OpenCV's."""
 
 logger = logging.getLogger(__name__)

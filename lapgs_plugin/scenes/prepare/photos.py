@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,9 +11,9 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from lapgs_plugin.errors import SceneError, counted, first_line, printable, require_extra
-from lapgs_plugin.limits import PHOTO_PIXELS
-from lapgs_plugin.scenes.images import JPEG
+from lapgs_plugin.errors import SceneError, counted, printable, require_extra
+from lapgs_plugin.files import whole_file
+from lapgs_plugin.scenes.images import JPEG, open_by_pillow
 from lapgs_plugin.scenes.masks import HEIC, has_photo_suffix
 
 SHOWN = 10
@@ -131,20 +132,14 @@ def convert_photo(source: Path, target: Path) -> None:
         import pillow_heif
 
         pillow_heif.register_heif_opener()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with Image.open(source) as photo:
-            width, height = photo.size
-            PHOTO_PIXELS.check(width * height, f"{source}: {width}x{height} pixels", "make it smaller", SceneError)
-            if photo.format == "WEBP" and photo.has_transparency_data:
-                raise SceneError(f"{source}: a WebP photo with transparency, expected none in WebP; convert it to PNG")
-            exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
-            photo.convert("RGB").save(target, **JPEG, exif=exif)
-    except SceneError:
-        raise
-    except (OSError, SyntaxError, ValueError, RuntimeError) as error:
-        why = first_line(error)  # libheif ends its messages with a newline
-        raise SceneError(f"{source}: the photo cannot be decoded ({why}); copy or convert it again") from error
+    encoded = io.BytesIO()
+    with open_by_pillow(source, "the photo cannot be decoded") as photo:
+        if photo.format == "WEBP" and photo.has_transparency_data:
+            raise SceneError(f"{source}: a WebP photo with transparency, expected none in WebP; convert it to PNG")
+        exif = photo.getexif()  # pillow-heif turns the pixels, and resets the orientation
+        photo.convert("RGB").save(encoded, **JPEG, exif=exif)
+    with whole_file(target, "photo") as unfinished:
+        unfinished.write_bytes(encoded.getbuffer())
 
 
 def camera_of(photo: Path) -> tuple[str, ...]:
