@@ -79,6 +79,20 @@ def damaged_jpeg(data: bytes, random: Random) -> bytes:
     return data[:at] + random.choice((b"\0\0", b"\xff\xff", b"\0\1", b"\x0c\1", b"\x7f\xff")) + data[at + 2 :]
 
 
+def damaged_phone_photo(data: bytes, random: Random) -> bytes:
+    """A side of a HEIC or WebP photo, or the pixels of one whose copy was interrupted."""
+    if random.random() < 0.4:
+        return damaged_file(data, random)
+    if random.random() < 0.3:
+        at = random.randrange(len(data))
+        return data[:at] + bytes(len(data) - at)
+    if (box := data.find(b"ispe")) >= 0:
+        at = box + 8 + random.choice((0, 4))
+        return data[:at] + struct.pack(">I", random.choice(SIDES)) + data[at + 4 :]
+    at = data.find(b"VP8") + random.choice((14, 16))
+    return data[:at] + struct.pack("<H", random.choice(SIDES) % 2**16) + data[at + 2 :]
+
+
 def damaged_gif(data: bytes, random: Random) -> bytes:
     """Sides of the screen or of the picture in it, and how many colours the palette has."""
     if random.random() < 0.5:

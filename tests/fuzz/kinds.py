@@ -16,6 +16,7 @@ from tests.fuzz.formats import (
     damaged_gif,
     damaged_jpeg,
     damaged_lines,
+    damaged_phone_photo,
     damaged_ply,
     damaged_png,
     damaged_store,
@@ -134,6 +135,10 @@ KINDS = (
             ("tif", damaged_tiff, (0, 1, 2)),
         )
         for index in indices
+    ),
+    *(
+        Kind(f"photo {suffix}", f"phone/0.{suffix}", damaged_phone_photo, [("convert-photo", f"phone/0.{suffix}")])
+        for suffix in ("heic", "webp")
     ),
     Kind(
         "experiment",

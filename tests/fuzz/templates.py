@@ -21,6 +21,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pillow_heif
 import pycolmap
 import torch
 from PIL import Image
@@ -68,6 +69,10 @@ def make_templates(folder: Path, reader: Reader) -> Path:
     _write_foreign(folder)
     _write_experiment(folder, reader)
     shutil.copytree(patches_folder(), folder / "recipes")
+    pillow_heif.register_heif_opener()
+    for suffix in ("heic", "webp"):
+        (folder / "phone").mkdir(exist_ok=True)
+        write_photo(folder / "phone" / f"0.{suffix}", 0)
     (folder / "path").mkdir()
     (folder / "path" / "trajectory.json").write_text(as_json({**_intrinsics(), "frames": _frames(["a", "b"])}))
     return folder
@@ -100,7 +105,8 @@ def write_transforms_scene(folder: Path, suffix: str = "png") -> None:
         write_photo(folder / name, index)
     # Where the file does not say the size of its photos, their own is taken.
     intrinsics = _intrinsics() if folder.name == "scene_json" else {"camera_angle_x": 1.0}
-    values = {**intrinsics, "ply_file_path": "points3d.ply", "frames": _frames(names)}
+    lists = {"train_filenames": names, "test_filenames": [Path(names[0]).name], "camera_model": "opencv"}
+    values = {**intrinsics, **lists, "ply_file_path": "points3d.ply", "frames": _frames(names)}
     (folder / "transforms.json").write_text(as_json(values))
     rows = [f"{x:.4f} {y:.4f} {z:.4f} 200 100 50" for x, y, z in torch.rand(POINTS, 3).tolist()]
     properties = [f"property float {axis}" for axis in "xyz"]
