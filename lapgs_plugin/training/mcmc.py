@@ -131,7 +131,7 @@ class McmcDensifier(DensityControl):
         if iteration <= COLORLESS * self._schedule.densify_until:
             return 0.0
         # A mean over fewer Gaussians pulls harder at each: those that removal leaves would follow, to the last one.
-        return weight * min(1.0, len(model) / self.state["start"])
+        return weight * min(1.0, len(model) / float(self.state["start"]))
 
     def _move_dead(self, model: TrainableField) -> None:
         opacities = torch.sigmoid(model.params["opacities"])
