@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shutil
 from pathlib import Path
@@ -15,6 +16,12 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.untrusted import JSON_MIB, JSON_MIB_VARIABLE
 from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, prose
+
+_spec = importlib.util.spec_from_file_location("tables", ROOT / "docs/tables.py")
+assert _spec is not None
+assert _spec.loader is not None
+tables = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(tables)
 
 WITH_COMMANDS = [path for path in PAGES if commands(path)]
 OF_OTHERS = {
@@ -117,11 +124,20 @@ def test_the_readme_is_a_screen_and_a_half() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
 
 
-def test_figures_of_the_readme_are_rows_of_the_results() -> None:
-    rows = [line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
-    results = (ROOT / "docs/results.md").read_text(encoding="utf-8").splitlines()
-    assert len(rows) == 1 + 8  # its head and eight rows
-    assert [row for row in rows if row not in results] == []
+def test_the_results_can_be_read_at_once() -> None:
+    assert len((ROOT / "docs/results.md").read_text(encoding="utf-8").splitlines()) <= 160
+
+
+@pytest.mark.parametrize("document", tables.DOCUMENTS, ids=name_of)
+def test_tables_show_the_data_files(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    assert tables.rewritten(text) == text, "run docs/tables.py"
+
+
+def test_tables_show_means_over_seeds_and_ratios_to_the_baseline() -> None:
+    """On bonsai one field takes 31.8 and 32.0 s, laplacian 23.5 and 23.9 s, which is 1.35x."""
+    (row,) = [line for line in tables.train().splitlines() if line.startswith("|  | laplacian | 23.7 ")]
+    assert [cell.strip() for cell in row.split("|")[4:6]] == ["1.35x", "31.96"]
 
 
 @pytest.mark.parametrize("document", [path for path in PAGES if path.name != "results.md"], ids=name_of)

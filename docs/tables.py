@@ -1,0 +1,148 @@
+"""Write the tables of README.md and docs/results.md from the measured runs in docs/data/.
+
+Run `python docs/tables.py` after changing a data file; a test compares the documents with it. A table stands between
+`<!-- table: NAME -->` and `<!-- end -->`. Each row of a data file is one run; a table shows means over seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "docs/data"
+DOCUMENTS = (ROOT / "README.md", ROOT / "docs/results.md")
+MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+Run = Mapping[str, str]
+Runs = Sequence[Run]
+METHODS = ("FastGS", "own script", "one field", "nested", "laplacian")
+QUALITY = {
+    "PSNR (dB)": ("psnr", "{:.2f}"),
+    "after fit (dB)": ("psnr_fit", "{:.2f}"),
+    "SSIM": ("ssim", "{:.4f}"),
+    "LPIPS": ("lpips", "{:.4f}"),
+}
+COST = {"busy (s)": ("busy_seconds", "{:.1f}"), "peak GB": ("peak_gb", "{:.2f}")}
+
+
+def rewritten(text: str) -> str:
+    """Return a document with the contents of its tables made anew."""
+    return MARKED.sub(lambda match: match[1] + TABLES[match[2]]() + match[3], text)
+
+
+def runs_of(name: str) -> Runs:
+    """Return the runs of a data file."""
+    with (DATA / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def mean(runs: Runs, column: str) -> float | None:
+    """Return the mean of a column over runs; None if one of them lacks it."""
+    values = [run[column] for run in runs]
+    return fmean(map(float, values)) if values and all(values) else None
+
+
+def shown(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def grouped(runs: Runs, *columns: str) -> dict[tuple[str, ...], dict[str, list[Run]]]:
+    """Return runs by the values of columns, then by method, in the order of the file."""
+    groups: dict[tuple[str, ...], dict[str, list[Run]]] = {}
+    for run in runs:
+        groups.setdefault(tuple(run[name] for name in columns), {}).setdefault(run["method"], []).append(run)
+    return groups
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table; text columns are the first two."""
+    lines = [header, ["---" if n < 2 else "--:" for n in range(len(header))], *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def measured(runs: Runs, baseline: Runs, columns: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Return the cells of a group of runs: seconds, how many times as fast as the baseline, and the named columns."""
+    seconds, base = mean(runs, "seconds"), mean(baseline, "seconds")
+    ratio = base / seconds if seconds and base and runs is not baseline else None
+    cells = [shown(mean(runs, name), form) for name, form in columns.values()]
+    return [shown(seconds, "{:.1f}"), shown(ratio, "{:.2f}x"), *cells]
+
+
+def compared(name: str, baseline: str, titles: Callable[[Run], str], groups: Sequence[str], with_fit: bool) -> str:
+    """Return a table with a row for each method of each group of runs."""
+    columns = {**{title: QUALITY[title] for title in QUALITY if with_fit or title != "after fit (dB)"}, **COST}
+    header = ["", "method", "seconds", f"against {baseline}", *columns, "runs"]
+    rows = []
+    for methods in grouped(runs_of(name), *groups).values():
+        first = titles(next(iter(methods.values()))[0])
+        for method in sorted(methods, key=METHODS.index):
+            cells = measured(methods[method], methods[baseline], columns)
+            rows.append([first, method, *cells, str(len(methods[method]))])
+            first = ""
+    return markdown(header, rows)
+
+
+def scene_title(run: Run) -> str:
+    return f"{run['scene']}, {run['views']} of {run['width']}x{run['height']}"
+
+
+def train() -> str:
+    """Return `lapgs train` on a GPU beside FastGS's own script."""
+    return compared("train", "one field", scene_title, ("scene",), with_fit=True)
+
+
+def checkouts(fastgs: bool) -> str:
+    """Return checkouts under `lapgs run` beside their own scripts: FastGS, or the others."""
+
+    def title(run: Run) -> str:
+        options = f", `{run['options']}`" if run["options"] else ""
+        return f"{run['checkout']}, {run['scene']}{options} ({run['gpu']}, {run['date']})"
+
+    runs = [run for run in runs_of("checkouts") if (run["checkout"] == "FastGS") == fastgs]
+    columns = {title: QUALITY[title] for title in ("PSNR (dB)", "LPIPS")} | {"peak GB": COST["peak GB"]}
+    rows = []
+    for methods in grouped(runs, "checkout", "scene").values():
+        first = title(methods["own script"][0])
+        for method in sorted(methods, key=METHODS.index):
+            rows.append([first, method, *measured(methods[method], methods["own script"], columns)])
+            first = ""
+    return markdown(["", "method", "seconds", "against its script", *columns], rows)
+
+
+def cpu() -> str:
+    """Return `lapgs train` without a GPU."""
+    columns = {"PSNR (dB)": QUALITY["PSNR (dB)"]}
+    rows = []
+    for (scene,), methods in grouped(runs_of("cpu"), "scene").items():
+        for n, (method, runs) in enumerate(methods.items()):
+            rows.append(["" if n else scene, method, *measured(runs, methods["one field"], columns), str(len(runs))])
+    return markdown(["", "method", "seconds", "against one field", *columns, "runs"], rows)
+
+
+def headline() -> str:
+    """Return README's table: three scenes, one figure a cell."""
+    rows = []
+    for (scene,), methods in grouped(runs_of("train"), "scene").items():
+        if scene not in ("bonsai", "train", "fox"):
+            continue
+        for unit, column, form in (("seconds", "seconds", "{:.0f}"), ("PSNR, dB", "psnr", "{:.1f}")):
+            cells = [shown(mean(methods[method], column), form) for method in METHODS if method in methods]
+            rows.append([scene_title(methods["nested"][0]) if unit == "seconds" else "", unit, *cells])
+    return markdown(["", "", *(method for method in METHODS if method != "own script")], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "headline": headline,
+    "train": train,
+    "fastgs": lambda: checkouts(True),
+    "forks": lambda: checkouts(False),
+    "cpu": cpu,
+}
+
+if __name__ == "__main__":
+    for document in DOCUMENTS:
+        document.write_text(rewritten(document.read_text(encoding="utf-8")), encoding="utf-8")
