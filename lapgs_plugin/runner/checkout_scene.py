@@ -8,8 +8,9 @@ from typing import Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.runner.object_values import with_values
+from lapgs_plugin.scenes.colmap import why_no_points
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class CheckoutScene:
             folder: receives the files that the Scene writes beside a model.
 
         Raises:
+            SceneError: the scene has no points.
             UserInputError: the Scene initialised no model from points, or has cameras at several resolutions.
         """
         model = _PointRecorder()
@@ -41,6 +43,8 @@ class CheckoutScene:
                 f"the Scene of {adapter.root} initialised no model with create_from_pcd, expected of "
                 f"{adapter.info.title}; choose another --backbone, or train with `lapgs run --off`"
             )
+        if not len(getattr(model.points, "points", ())):  # 3DGS's points are None if it cannot read their PLY
+            raise SceneError(why_no_points(Path(call.dataset.source_path)))
         for name in ("train_cameras", "test_cameras"):
             scales = getattr(scene, name, None)
             if not isinstance(scales, dict) or len(scales) != 1:

@@ -12,6 +12,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,9 +22,10 @@ from numpy.typing import NDArray
 
 from lapgs_plugin.errors import SceneError, counted, printable
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.ply import read_ply, scalar_names
 from lapgs_plugin.files import is_file, is_folder
+from lapgs_plugin.scenes.aligned_points import aligned_points
 from lapgs_plugin.scenes.images import find_image, image_size, where_else
+from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
 from lapgs_plugin.scenes.random_points import CAPTURE_RADIUS, OBJECT_RADIUS, random_points
 from lapgs_plugin.scenes.source import (
     ALL_AROUND,
@@ -64,7 +66,6 @@ CAMERA_MODELS = {name.replace("_", ""): name for name in (*PINHOLE_MODELS, FISHE
     "RADIALFISHEYE": FISHEYE,
 }
 """COLMAP's camera models by the letters and digits of the names that programs write."""
-POINT_COLORS = ("red", "green", "blue")
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
 Values = dict[str, Any]
@@ -84,8 +85,8 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
     file holds out its `test_frames` (ScanNet++) and those of its lists `test_filenames` and `val_filenames`
     (nerfstudio), or every eighth view. Without it all of these are trained on, as 3DGS does with both files of a pair.
     Frames marked `is_bad`, and frames in no list of a file that has `train_filenames`, are left out. If there is no PLY
-    of points (`ply_file_path` or points3d.ply), 100,000 random grey points fill a cube around the point that the
-    cameras look at.
+    of points (`ply_file_path` or points3d.ply) and no COLMAP model that fits the frames, 100,000 random grey points
+    fill a cube around the point that the cameras look at.
 
     Args:
         path: the scene folder.
@@ -109,10 +110,19 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
     elif evaluate:
         raise SceneError(f"{path / TEST_FILES[0]}: no such file, expected the views to hold out; train without --eval")
     parted = _parted(file, train, held_out, evaluate, warnings)
-    points, colors = _read_points(file, values, warnings) or random_points(
-        [*parted[0], *parted[1]], CAPTURE_RADIUS if single else OBJECT_RADIUS
-    )
+    frames = [*parted[0], *parted[1]]
+    if (cloud := _read_points(file, values, frames, warnings)) is not None:
+        points, colors = cloud.xyz, cloud.rgb
+    else:
+        points, colors = random_points(frames, CAPTURE_RADIUS if single else OBJECT_RADIUS)
     return SceneSource("transforms", *parted, points, colors, tuple(warnings))
+
+
+def count_frames(path: Path) -> int | None:
+    """Return how many frames transforms.json lists; None if it is not there or cannot be read."""
+    with suppress(SceneError):
+        return len(_read_json(path / SINGLE_FILE)["frames"]) if is_file(path / SINGLE_FILE) else None
+    return None
 
 
 def _parted(
@@ -389,10 +399,8 @@ def _focal(values: Values, axis: str, side: int) -> float | None:
     return None
 
 
-def _read_points(
-    transforms: Path, values: Values, warnings: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return positions and colours (n, 3) of the scene's PLY; None if there is none."""
+def _read_points(transforms: Path, values: Values, frames: Sequence[Frame], warnings: list[str]) -> PointCloud | None:
+    """Return the points of the scene's PLY, or else of a COLMAP model that fits the frames; None if there are none."""
     path, named = transforms.parent, values.get("ply_file_path") or ""
     if not isinstance(named, str):
         raise SceneError(
@@ -401,24 +409,11 @@ def _read_points(
     name = PurePosixPath(_portable(named))
     places = [find_image(path / spelling) for spelling in (name, name.name, *POINT_FILES)]
     file = next((place for place in places if is_file(place)), None)
-    subject = f"{transforms} names {file}" if file in places[:2] else f"{file}"
-    if named and file not in places[:2]:  # nerfstudio, too, takes random points then
-        warnings.append(f"{transforms} names {named}: no such file; training starts from {file or 'random points'}")
     if file is None:
-        return None
-    try:
-        element = read_ply(file)["vertex"]
-    except (OSError, KeyError, ValueError) as error:
-        raise SceneError(f"{subject}: not readable as a PLY of points ({error}); export or remove it") from error
-    vertices, channels = element.data, POINT_COLORS
-    lists = {prop.name for prop in element.properties} - scalar_names(element)
-    if unusable := sorted(set("xyz") - scalar_names(element) | lists.intersection(channels)):
-        raise SceneError(
-            f"{subject}: not readable as a PLY of points ({', '.join(unusable)} missing or a list, expected a number "
-            "of each point); export or remove it"
-        )
-    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    if not set(channels) <= scalar_names(element):
-        return points, np.full_like(points, 0.5)
-    colors = np.stack([vertices[channel] for channel in channels], axis=1)
-    return points, colors / 255.0 if colors.dtype == np.uint8 else colors.astype(np.float64)
+        cloud = aligned_points(path, frames)
+    else:
+        cloud = read_point_cloud(file, f"{transforms} names {file}" if file in places[:2] else f"{file}")
+    if named and file not in places[:2] and (file or not cloud):  # nerfstudio, too, takes random points then
+        warnings.append(f"{transforms} names {named}: no such file; training starts from {file or 'random points'}")
+    warnings += [cloud.warning] if cloud and cloud.warning else []
+    return cloud

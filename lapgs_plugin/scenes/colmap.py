@@ -1,11 +1,9 @@
-"""Read COLMAP scenes: `images/` and a sparse model in `sparse/0/` or `sparse/`, binary or text.
-
-The formats are described at https://colmap.github.io/format.html; pycolmap reads them.
-"""
+"""Read COLMAP scenes: `images/` and a sparse model in `sparse/0/` or `sparse/`, binary or text."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -15,12 +13,13 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.errors import SceneError, joined
+from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
-from lapgs_plugin.scenes.colmap_binary import check_whole, disagreement
-from lapgs_plugin.scenes.colmap_text import check_text
+from lapgs_plugin.scenes.colmap_model import MODEL_FILES, Model, count_images, read_model
+from lapgs_plugin.scenes.colmap_records import PosedImage
 from lapgs_plugin.scenes.images import find_image, where_else
+from lapgs_plugin.scenes.point_cloud import read_point_cloud
 from lapgs_plugin.scenes.random_points import random_points
 from lapgs_plugin.scenes.source import (
     PINHOLE_MODELS,
@@ -32,13 +31,8 @@ from lapgs_plugin.scenes.source import (
     undistort_hint,
 )
 
-MODEL_FILES = ("cameras", "images", "points3D")
-
 MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0")
 """Where COLMAP, nerfstudio and the 3DGS repository's convert.py leave models of photos that are not undistorted."""
-
-UNIT_TOLERANCE = 1e-2
-"""Largest difference of a quaternion's length from 1; COLMAP writes 17 digits."""
 
 
 def find_model(path: Path, places: Sequence[str] = MODEL_PLACES[:2]) -> Path | None:
@@ -54,16 +48,8 @@ def largest_model(path: Path, model: Path) -> Path:
 
     COLMAP's mapper numbers a model for each group of photos that nothing connects as it finds them, not by size.
     """
-    beside = [each for place in MODEL_PLACES for each in sorted((path / place).parent.glob("[0-9]*"))]
-    return max([model, *beside], key=count_images)
-
-
-def count_images(model: Path) -> int:
-    """Return how many images a binary model has; 0 of other folders."""
-    if not all(is_file(model / f"{name}.bin") for name in MODEL_FILES):
-        return 0
-    with (model / "images.bin").open("rb") as stream:
-        return int.from_bytes(stream.read(8), "little")
+    beside = [each for place in MODEL_PLACES for each in sorted((path / place).parent.glob("[0-9]*")) if each != model]
+    return max([model, *beside], key=count_images) if beside else model
 
 
 def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
@@ -78,87 +64,87 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
     Raises:
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
-    reconstruction = read_model(model)
-    for key in sorted({image.camera_id for image in reconstruction.images.values() if image.has_pose}):
-        _refuse_distortion(reconstruction.cameras[key], model, path)
+    sparse = read_model(model)
+    for camera in _used_cameras(sparse):
+        if distortion := _distortion(camera):
+            hint = undistort_hint(path, camera.model.name)
+            raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({distortion}); {hint}")
     folder = path / images
-    source = source_of(reconstruction, model, folder)
+    source = source_of(sparse, folder)
     if not is_folder(folder):
         first = next((frame.name for frame in source.train), "")
         raise SceneError(f"{folder}: no such folder of images; {where_else(path, first)}")
     train, test = hold_out(source.train, evaluate)
-    warnings = source.warnings
-    if (larger := largest_model(path, model)) != model:
-        warnings += (
-            f"{model} places {count_images(model)} photos and {larger} {count_images(larger)}; make a scene of the "
-            f"latter with `lapgs prepare {quote(str(path))} OUT`",
-        )
-    return replace(source, train=train, test=test, warnings=warnings)
+    return replace(source, train=train, test=test, warnings=source.warnings + larger_model(path, model))
 
 
-def source_of(reconstruction: pycolmap.Reconstruction, model: Path, folder: Path) -> SceneSource:
+def larger_model(path: Path, model: Path) -> tuple[str, ...]:
+    """Return a line if another model in a scene folder has more photos than the one that is read."""
+    if (larger := largest_model(path, model)) == model:
+        return ()
+    return (
+        f"{model} places {count_images(model)} photos and {larger} {count_images(larger)}; make a scene of the latter "
+        f"with `lapgs prepare {quote(str(path))} OUT --model {quote(str(larger))}`",
+    )
+
+
+def source_of(model: Model, folder: Path) -> SceneSource:
     """Return frames and points of a model, with pinhole cameras even where the model's are distorted.
 
     A model without points gets random ones.
 
     Args:
-        reconstruction: the model, whose cameras are perspective or fisheye.
-        model: its folder.
+        model: its cameras are perspective or fisheye.
         folder: of the images, of which some may be missing.
 
     Raises:
-        SceneError: a name, a pose or a camera cannot be used.
+        SceneError: a pose or a camera cannot be used.
     """
-    posed = [image for image in reconstruction.images.values() if image.has_pose]
-    cameras = {key: _intrinsics(reconstruction.cameras[key]) for key in {image.camera_id for image in posed}}
-    frames = [_frame(model, folder, cameras[image.camera_id], image) for image in posed]
-    points = np.array([point.xyz for point in reconstruction.points3D.values()], np.float64)
-    colors = np.array([point.color for point in reconstruction.points3D.values()], np.float64) / 255.0
-    warnings: tuple[str, ...] = ()
+    cameras = {key: _intrinsics(model.cameras[key]) for key in {image.camera_id for image in model.images.values()}}
+    frames = [_frame(model.folder, folder, cameras[image.camera_id], image) for image in model.images.values()]
+    points, colors, warnings = model.points.xyz, model.points.rgb / 255.0, model.warnings
     if not len(points) and frames:  # known cameras, of a phone or a renderer
-        warnings = (f"{model}: the model has no 3D points; training starts from random ones",)
+        warnings += (f"{model.folder}: the model has no 3D points; training starts from random ones",)
         points, colors = random_points(frames)
     return SceneSource("colmap", in_name_order(frames), (), points, colors, warnings)
 
 
-def read_model(model: Path) -> pycolmap.Reconstruction:
-    """Read the COLMAP model in a folder, binary or text.
-
-    Raises:
-        SceneError: it is incomplete or unreadable.
-    """
-    suffix = next(
-        (s for s in ("bin", "txt") if all(is_file(model / f"{name}.{s}") for name in MODEL_FILES)),
-        None,
+def why_no_points(path: Path) -> str:
+    """Return why a codebase of 3DGS finds no points in a scene folder, and what to do about it, in one line."""
+    model = find_model(path)
+    ply, train = (model or path) / f"points3{'D' if model else 'd'}.ply", f"`lapgs train {quote(str(path))}`"
+    in_model = in_ply = 0
+    with suppress(SceneError):
+        in_model = 0 if model is None else len(read_model(model).points.xyz)
+    with suppress(SceneError):
+        in_ply = len(read_point_cloud(ply, "").xyz)
+    if not is_file(ply):
+        return f"{model or path}: no points in it, expected some to start from; train with {train}, which makes them"
+    what = f"its {in_ply} points are not readable for this codebase" if in_ply else "no points in it"
+    if not in_model:
+        return f"{ply}: {what}, expected x, y, z, nx, ny, nz, red, green and blue of each point; export it again"
+    return (
+        f"{ply}: {what}, expected the {in_model} of the model; remove the file, so that this codebase writes it again. "
+        f"If it is empty then, this codebase leaves out points without tracks: train with {train}"
     )
-    if suffix is None:
-        found = ", ".join(sorted(entry.name for entry in model.iterdir() if entry.stem in MODEL_FILES))
-        raise SceneError(
-            f"{model}: the sparse model is incomplete, it has only {found}; "
-            "expected cameras, images and points3D, all as .bin or all as .txt"
-        )
-    names: dict[int, str] = {}
-    if suffix == "bin":
-        check_whole(model)
-    else:
-        names = check_text(model)
-    try:
-        reconstruction = pycolmap.Reconstruction(str(model))
-    except Exception as error:  # pycolmap raises ValueError, IndexError, RuntimeError or MemoryError on broken files
-        reason = (disagreement(model) if suffix == "bin" else None) or f"its files do not agree: {joined(error)}"
-        raise SceneError(f"{model}: the sparse model cannot be read ({reason}); copy or export it again") from error
-    for key, name in names.items():
-        reconstruction.images[key].name = name
-    return reconstruction
 
 
-def _refuse_distortion(camera: pycolmap.Camera, model: Path, scene: Path) -> None:
+def is_straight(model: Model) -> bool:
+    """Return whether no image of a model is distorted."""
+    return not any(map(_distortion, _used_cameras(model)))
+
+
+def _used_cameras(model: Model) -> list[pycolmap.Camera]:
+    return [model.cameras[key] for key in sorted({image.camera_id for image in model.images.values()})]
+
+
+def _distortion(camera: pycolmap.Camera) -> str:
+    """Return the model of a distorted camera and its parameters, or ""."""
     kind = camera.model.name
     distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
-    if kind not in PINHOLE_MODELS or any(distortion):
-        values = f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else ""
-        hint = undistort_hint(scene, kind)
-        raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({kind}{values}); {hint}")
+    if kind in PINHOLE_MODELS and not any(distortion):
+        return ""
+    return kind + (f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else "")
 
 
 def _intrinsics(camera: pycolmap.Camera) -> Camera:
@@ -175,23 +161,15 @@ def _intrinsics(camera: pycolmap.Camera) -> Camera:
     )
 
 
-def _frame(model: Path, folder: Path, camera: Camera, image: pycolmap.Image) -> Frame:
-    try:
-        name = image.name
-    except UnicodeDecodeError as error:
+def _frame(model: Path, folder: Path, camera: Camera, image: PosedImage) -> Frame:
+    if not image.has_rotation:
+        numbers = ", ".join(f"{number:g}" for number in image.numbers[:4])
         raise SceneError(
-            f"{model}: the name of image {image.image_id} is {error.object!r}, expected UTF-8; rename it and "
-            "reconstruct again"
-        ) from error
-    pose: NDArray[np.float64] = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()  # (3, 4)
-    posed = replace(camera, world_to_camera=torch.from_numpy(pose))
-    check_camera(f"{model}: the camera of {name}", posed)
-    quaternion = image.cam_from_world().rotation.quat  # (4,) x, y, z, w
-    if abs(float(np.linalg.norm(quaternion)) - 1.0) > UNIT_TOLERANCE:
-        numbers = ", ".join(f"{number:g}" for number in quaternion)
-        raise SceneError(
-            f"{model}: the rotation of {name} is the quaternion ({numbers}), expected one of length 1; copy or export "
-            "the model again"
+            f"{model}: the rotation of {image.name} is the quaternion ({numbers}), expected one of length 1; copy or "
+            "export the model again"
         )
-    return Frame(name, find_image(folder / name), posed)
+    pose: NDArray[np.float64] = np.eye(4)
+    pose[:3] = image.pose.matrix()  # (3, 4)
+    posed = replace(camera, world_to_camera=torch.from_numpy(pose))
+    check_camera(f"{model}: the camera of {image.name}", posed)
+    return Frame(image.name, find_image(folder / image.name), posed)

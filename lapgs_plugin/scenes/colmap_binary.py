@@ -1,117 +1,147 @@
-"""Check that COLMAP's binary files are complete, before pycolmap reads them.
+"""Read COLMAP's binary files (https://colmap.github.io/format.html) by their counts, which damage makes absurd.
 
-pycolmap trusts the counts in these files. In a truncated file it reads uninitialised memory, or allocates and loops for
-minutes. The layout is that of https://colmap.github.io/format.html, and for rigs and frames that of COLMAP's
-reconstruction_io_binary.cc.
+pycolmap trusts these counts: in a truncated file it reads uninitialised memory, or allocates and loops for minutes.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pycolmap
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import refuse_lfs_pointer
+from lapgs_plugin.scenes.colmap_records import LARGEST_ID, NO_FEATURES, Points, PosedImage, file_name
 
-COUNT = struct.Struct("<Q")
-SMALL_COUNT = struct.Struct("<I")
-POSE_BYTES = 7 * 8  # quaternion and translation
-SENSOR_BYTES = 4 + 4  # type and id
-
-
-def check_whole(folder: Path) -> None:
-    """Check the binary files of the model in `folder`.
-
-    Raises:
-        SceneError: a file ends before its last record, or is a pointer of Git LFS.
-    """
-    for name in RECORD_ENDS:
-        file = folder / f"{name}.bin"
-        if not file.is_file():
-            continue  # COLMAP before 3.12 writes no rigs and frames
-        data = file.read_bytes()
-        try:
-            for _ in _starts(name, data):
-                pass
-        # The data ends inside a record, a count or a name, or a camera model does not exist.
-        except (struct.error, ValueError) as error:
-            refuse_lfs_pointer(file, SceneError)
-            raise SceneError(
-                f"{file}: the file is damaged or cut short at {len(data)} bytes, expected all records that its header "
-                "counts; copy it again"
-            ) from error
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_POINT_BYTES = 8 + 3 * 8 + 3 + 8  # id, position, colour, error
+_OBSERVATION_BYTES = 2 * 8 + 8
+_TRACK_BYTES = 4 + 4
 
 
-def disagreement(folder: Path) -> str | None:
-    """Return which ids in complete binary files contradict each other, or None."""
-    data = {name: (folder / f"{name}.bin").read_bytes() for name in ("cameras", "images", "points3D")}
-    ids: dict[str, set[int]] = {}
-    for name, kind in (("cameras", "<I"), ("images", "<I"), ("points3D", "<Q")):
-        found = ids.setdefault(name, set())
-        for start in _starts(name, data[name]):
-            (key,) = struct.unpack_from(kind, data[name], start)
-            if key in found:
-                return f"{name}.bin holds id {key} twice, expected each once"
-            found.add(key)
-    for start in _starts("images", data["images"]):
-        image, camera = (int(struct.unpack_from("<I", data["images"], start + at)[0]) for at in (0, 4 + POSE_BYTES))
-        if camera not in ids["cameras"]:
-            return f"image {image} of images.bin has camera {camera}, expected one of cameras.bin"
-    return None
+class BinaryRecords:
+    """The bytes of a file, taken one after the other. Bytes after the last record do not matter."""
+
+    def __init__(self, file: Path) -> None:
+        self.data = file.read_bytes()
+        self.at = 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Return the next values; raise struct.error at the end of the file."""
+        values = layout.unpack_from(self.data, self.at)
+        self.at += layout.size
+        return values
+
+    def take_count(self) -> int:
+        return int(self.take(_COUNT)[0])
+
+    def skip(self, size: int) -> int:
+        """Return the offset before `size` bytes; raise struct.error where the file ends before them."""
+        start, self.at = self.at, self.at + size
+        if self.at > len(self.data):
+            raise struct.error
+        return start
 
 
-def _starts(name: str, data: bytes) -> Iterator[int]:
-    """Yield the offset of each record that the file's header counts.
+def read_cameras(file: Path) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of cameras.bin by id.
 
     Raises:
-        ValueError, struct.error: the data ends before.
+        SceneError: the file is damaged, or holds an id twice.
     """
-    end = COUNT.size
-    for _ in range(COUNT.unpack_from(data)[0]):
-        start, end = end, RECORD_ENDS[name](data, end)
-        if end > len(data):
-            raise ValueError(f"a record ends at {end}")
-        yield start
+    cameras: dict[int, pycolmap.Camera] = {}
+    with _whole(file) as records:
+        for _ in range(records.take_count()):
+            key, kind, width, height = records.take(_CAMERA)
+            camera = pycolmap.Camera.create_from_model_id(key, pycolmap.CameraModelId(kind), 1.0, 1, 1)
+            camera.width, camera.height = width, height
+            camera.params = list(records.take(struct.Struct(f"<{len(camera.params)}d")))
+            _check_id(file, key, cameras)
+            cameras[key] = camera
+    return cameras
 
 
-def _camera_end(data: bytes, start: int) -> int:
-    (model,) = struct.unpack_from("<i", data, start + 4)
-    camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model), 1.0, 1, 1)
-    return start + 4 + 4 + 8 + 8 + 8 * len(camera.params)
+def read_images(file: Path, observations: bool = False) -> dict[int, PosedImage]:
+    """Return the images of images.bin by id, with their features if `observations`.
+
+    Raises:
+        SceneError: the file is damaged, holds an id twice or a name that is no UTF-8.
+    """
+    images: dict[int, PosedImage] = {}
+    with _whole(file) as records:
+        for _ in range(records.take_count()):
+            key, *numbers, camera = records.take(_IMAGE)
+            name = records.data[records.at : records.data.index(b"\0", records.at)]
+            records.skip(len(name) + 1)
+            count = records.take_count()
+            start = records.skip(count * _OBSERVATION_BYTES)
+            _check_id(file, key, images)
+            features = NO_FEATURES
+            if observations:
+                rows = np.frombuffer(records.data, "<f8", count * 3, start).reshape(count, 3)
+                features = rows[:, :2].copy()  # the third has the bytes of an integer, the point's id
+            images[key] = PosedImage(_decoded(file, key, name), camera, np.array(numbers), features)
+    return images
 
 
-def _image_end(data: bytes, start: int) -> int:
-    name_end = data.index(b"\0", start + 4 + POSE_BYTES + 4) + 1
-    return name_end + COUNT.size + (8 + 8 + 8) * int(COUNT.unpack_from(data, name_end)[0])
+def read_points(file: Path, observations: bool = False) -> Points:
+    """Return the points of points3D.bin, with their tracks if `observations`.
+
+    Raises:
+        SceneError: the file is damaged.
+    """
+    starts, tracks = [], []
+    with _whole(file) as records:
+        for _ in range(records.take_count()):
+            starts.append(records.skip(_POINT_BYTES))
+            length = records.take_count()
+            track = records.skip(length * _TRACK_BYTES)
+            if observations:
+                tracks.append(np.frombuffer(records.data, "<u4", 2 * length, track).reshape(-1, 2).astype(np.int64))
+    rows = np.frombuffer(records.data, np.uint8)[np.array(starts, np.int64)[:, None] + np.arange(8, _POINT_BYTES)]
+    xyz, errors = (np.ascontiguousarray(part).view("<f8").astype(np.float64) for part in (rows[:, :24], rows[:, 27:]))
+    return Points(xyz, rows[:, 24:27].astype(np.float64), errors.ravel().tolist() if observations else (), tracks)
 
 
-def _point_end(data: bytes, start: int) -> int:
-    track = start + 8 + 3 * 8 + 3 + 8
-    return track + COUNT.size + (4 + 4) * int(COUNT.unpack_from(data, track)[0])
+def count_images(file: Path) -> int:
+    """Return how many images images.bin counts; 0 if it is too short for them."""
+    with file.open("rb") as stream:
+        count = int.from_bytes(stream.read(_COUNT.size), "little")
+    return count if count * _IMAGE.size <= file.stat().st_size else 0
 
 
-def _rig_end(data: bytes, start: int) -> int:
-    (sensors,) = SMALL_COUNT.unpack_from(data, start + 4)
-    end = start + 4 + SMALL_COUNT.size + (SENSOR_BYTES if sensors else 0)  # the reference sensor has no pose
-    for _ in range(sensors - 1):
-        (has_pose,) = struct.unpack_from("<?", data, end + SENSOR_BYTES)
-        end += SENSOR_BYTES + 1 + (POSE_BYTES if has_pose else 0)
-    return end
+@contextmanager
+def _whole(file: Path) -> Iterator[BinaryRecords]:
+    records = BinaryRecords(file)
+    try:
+        yield records
+    except SceneError:
+        raise
+    except (struct.error, ValueError) as error:  # the data ends inside a record or a name, or there is no such model
+        refuse_lfs_pointer(file, SceneError)
+        raise SceneError(
+            f"{file}: the file is damaged or cut short at {len(records.data)} bytes, expected all records that its "
+            "header counts; copy it again"
+        ) from error
 
 
-def _frame_end(data: bytes, start: int) -> int:
-    images = start + 4 + 4 + POSE_BYTES
-    return images + SMALL_COUNT.size + (SENSOR_BYTES + 8) * int(SMALL_COUNT.unpack_from(data, images)[0])
+def _check_id(file: Path, key: int, known: dict[int, Any]) -> None:
+    if key in known or key > LARGEST_ID:
+        what = f"id {key} twice, expected each once" if key in known else f"id {key}, expected at most {LARGEST_ID}"
+        raise SceneError(f"{file}: {file.name} holds {what}; copy or export the model again")
 
 
-RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
-    "cameras": _camera_end,
-    "images": _image_end,
-    "points3D": _point_end,
-    "rigs": _rig_end,
-    "frames": _frame_end,
-}
-"""For each file, the end of the record that starts at an offset."""
+def _decoded(file: Path, key: int, name: bytes) -> str:
+    try:
+        return file_name(name.decode())
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{file}: the name of image {key} is {name!r}, expected UTF-8; rename it and reconstruct again"
+        ) from error

@@ -1,48 +1,50 @@
-"""Check COLMAP's text files (https://colmap.github.io/format.html), before pycolmap reads them.
+"""Read COLMAP's text files (https://colmap.github.io/format.html), as COLMAP writes them and as people do.
 
-pycolmap's messages about mistakes quote its own source code, and it reads -96 pixels as 18446744073709551520.
+pycolmap ends a name at its first space, reads -96 pixels as 18446744073709551520, and refuses tracks that do not agree
+with the images. Training uses no tracks, so that lines of images.txt are told apart by what they hold: COLMAP writes
+two for each image, others one, or with empty lines in between.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import NoReturn
 
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.colmap_records import (
+    LARGEST_ID,
+    NO_FEATURES,
+    NO_TRACK,
+    UNIT_TOLERANCE,
+    Points,
+    PosedImage,
+    file_name,
+)
 
-_Number = TypeVar("_Number", int, float)
-
-LARGEST_ID = 2**32 - 2
-"""Largest id of a camera or an image; the next number means none."""
 SHOWN = 60
 """Characters of a line that are quoted in a message."""
+NUMBERS = frozenset("0123456789+-.einfaEINFA \t")
+"""Characters of lines of numbers. Names of photos have others, if only in their suffixes."""
 
-
-def check_text(folder: Path) -> dict[int, str]:
-    """Check the numbers in the text files of a model and that the ids they refer to exist. Return the images' names.
-
-    pycolmap ends a name at its first space.
-
-    Raises:
-        SceneError: a line is wrong.
-    """
-    cameras = _ids(folder / "cameras.txt", _check_camera)
-    names: dict[int, str] = {}
-    images = _ids(folder / "images.txt", lambda line: _check_image(line, cameras, names), pairs=True)
-    _ids(folder / "points3D.txt", lambda line: _check_point(line, images))
-    return names
+CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"
+IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
+POINT = "POINT3D_ID X Y Z R G B with finite numbers"
 
 
 class _Line:
-    """A line of a file and its words."""
+    """A line of a file: its first words, and the rest as the last one."""
 
-    def __init__(self, file: Path, number: int, text: str) -> None:
+    def __init__(self, file: Path, number: int, text: str, first_words: int) -> None:
         self.file, self.number, self.text = file, number, text
-        self.words = text.split()
+        self.words = text.split(maxsplit=first_words)
 
     def refuse(self, expected: str) -> NoReturn:
         quoted = self.text if len(self.text) <= SHOWN else f"{self.text[:SHOWN]}..."
@@ -50,87 +52,151 @@ class _Line:
             f"{self.file}: line {self.number} is {quoted!r}, expected {expected}; copy or export the model again"
         )
 
-    def numbers(self, kind: Callable[[str], _Number], words: Sequence[str], what: str) -> list[_Number]:
+    def whole(self, words: Sequence[str], what: str) -> list[int]:
+        """Return words as whole numbers, which numpy writes as 1.0, or refuse the line; `what` was expected."""
+        values = self.finite(words, what)  # ids and sizes are below 2 ** 53, from which on these round
+        if not all(value.is_integer() for value in values):
+            self.refuse(what)
+        return [int(value) for value in values]
+
+    def finite(self, words: Sequence[str], what: str) -> list[float]:
         """Return words as finite numbers, or refuse the line; `what` was expected."""
         try:
-            found = [kind(word) for word in words]
+            values = [float(word) for word in words]
         except ValueError:
             self.refuse(what)
-        if not all(map(math.isfinite, found)):
+        if not all(map(math.isfinite, values)):
             self.refuse(what)
-        return found
+        return values
 
 
-def _ids(file: Path, check: Callable[[_Line], int], pairs: bool = False) -> set[int]:
-    """Check the lines of a file and return their ids. With `pairs`, every second line lists observations."""
-    ids: set[int] = set()
-    for line in _lines(file, pairs):
-        key = check(line)
-        if key in ids:
-            line.refuse(f"each id once, {key} was there before")
-        ids.add(key)
-    return ids
+def _lines(file: Path, first_words: int = -1) -> Iterator[_Line]:
+    """Yield the lines of a file that are neither empty nor comments.
 
-
-def _lines(file: Path, pairs: bool) -> Iterator[_Line]:
+    Raises:
+        SceneError: the file is no text in UTF-8, with or without a byte-order mark.
+    """
     try:
-        with file.open(encoding="utf-8") as stream:
-            numbered = enumerate(stream, start=1)
-            for number, text in numbered:
+        with file.open(encoding="utf-8-sig") as stream:
+            for number, text in enumerate(stream, start=1):
                 if (stripped := text.strip()) and not stripped.startswith("#"):
-                    yield _Line(file, number, stripped)
-                    if not pairs:
-                        continue
-                    observations = _Line(file, number + 1, next(numbered, (0, ""))[1].strip())
-                    if len(observations.words) % 3:
-                        observations.refuse("X Y POINT3D_ID for each observation")
+                    yield _Line(file, number, stripped, first_words)
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{file}: not readable as text in UTF-8 ({error}); copy or export the model again") from error
 
 
-def _check_camera(line: _Line) -> int:
-    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"
-    if len(line.words) < 4:
-        line.refuse(expected)
-    key, width, height = line.numbers(int, [line.words[0], *line.words[2:4]], expected)
-    if not 0 <= key <= LARGEST_ID or min(width, height) < 1:
-        line.refuse(f"{expected} with positive numbers")
-    model = line.words[1]
-    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-        line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
-    count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
-    if len(line.numbers(float, line.words[4:], f"{count} finite parameters of {model}")) != count:
-        line.refuse(f"{count} parameters of {model}, not {len(line.words) - 4}")
-    return key
+def read_cameras(file: Path) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of cameras.txt by id.
+
+    Raises:
+        SceneError: a line is wrong.
+    """
+    cameras: dict[int, pycolmap.Camera] = {}
+    for line in _lines(file):
+        if len(line.words) < 4:
+            line.refuse(CAMERA)
+        key, width, height = line.whole([line.words[0], *line.words[2:4]], CAMERA)
+        _check_id(line, key, cameras)
+        if min(width, height) < 1:
+            line.refuse(f"{CAMERA} with positive numbers")
+        model = line.words[1]
+        if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+            line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
+        camera = pycolmap.Camera.create_from_model_name(key, model, 1.0, 1, 1)
+        count = len(camera.params)
+        if len(values := line.finite(line.words[4:], f"{count} finite parameters of {model}")) != count:
+            line.refuse(f"{count} parameters of {model}, not {len(values)}")
+        camera.width, camera.height, camera.params = min(width, 2**64 - 1), min(height, 2**64 - 1), values
+        cameras[key] = camera
+    return cameras
 
 
-def _check_image(line: _Line, cameras: set[int], names: dict[int, str]) -> int:
-    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
-    if len(line.words) < 10:
-        line.refuse(expected)
-    key, camera = line.numbers(int, [line.words[0], line.words[8]], expected)
-    quaternion = line.numbers(float, line.words[1:8], expected)[:4]
+def read_images(file: Path, observations: bool = False) -> dict[int, PosedImage]:
+    """Return the images of images.txt by id, with their features if `observations`.
+
+    Lines of features that are damaged count as none.
+
+    Raises:
+        SceneError: the line of an image is wrong.
+    """
+    images: dict[int, PosedImage] = {}
+    key, next_number = -1, 0  # of the last image, and the line that COLMAP writes its features in
+    one_line = False  # an image each
+    for line in _lines(file, 9):
+        follows = line.number == next_number
+        if set(line.text) <= NUMBERS and _holds_features(words := line.text.split(), follows and not one_line):
+            if observations and key in images:
+                images[key] = replace(images[key], features=_features(words))
+            key = -1
+            continue
+        one_line |= follows
+        if len(line.words) < 10:
+            line.refuse(IMAGE)
+        key, camera = line.whole([line.words[0], line.words[8]], IMAGE)
+        _check_id(line, key, images)
+        pose = np.array(line.finite(line.words[1:8], IMAGE))
+        images[key], next_number = PosedImage(file_name(line.words[9]), camera, pose, NO_FEATURES), line.number + 1
+    return images
+
+
+def _holds_features(words: list[str], expected: bool) -> bool:
+    """Return whether a line of numbers holds features, and not an image that is cut short or whose name is a number."""
+    triples = len(words) % 3 == 0
+    try:
+        key, *quaternion = map(float, words[:5])
+    except ValueError:
+        return expected
+    length = math.hypot(*quaternion)
+    image = key.is_integer() and (
+        length <= 1.0 + UNIT_TOLERANCE if len(quaternion) < 4 else abs(length - 1.0) < UNIT_TOLERANCE
+    )
+    return expected and triples if image else expected or triples
+
+
+def _features(words: list[str]) -> NDArray[np.float64]:
+    with suppress(ValueError):
+        return np.array(words, np.float64).reshape(-1, 3)[:, :2]
+    return NO_FEATURES
+
+
+def read_points(file: Path, observations: bool = False) -> Points:
+    """Return the points of points3D.txt, with their tracks if `observations`. Damaged tracks count as none.
+
+    Raises:
+        SceneError: a position or a colour is wrong.
+    """
+    xyz: list[list[float]] = []
+    rgb: list[list[int]] = []
+    errors: list[float] = []
+    tracks: list[NDArray[np.int64]] = []
+    for line in _lines(file, 8):
+        if len(line.words) < 7:
+            line.refuse(POINT)
+        xyz.append(line.finite(line.words[1:4], POINT))
+        rgb.append(line.whole(line.words[4:7], POINT))
+        if not 0 <= min(rgb[-1]) <= max(rgb[-1]) <= 255:
+            line.refuse("colours from 0 to 255")
+        if observations:
+            errors.append(_number(line.words[7:8]))
+            tracks.append(_track(line.words[8:]))
+    positions, colors = (np.array(rows, np.float64).reshape(-1, 3) for rows in (xyz, rgb))
+    return Points(positions, colors, errors, tracks)
+
+
+def _number(words: list[str]) -> float:
+    with suppress(ValueError, IndexError):
+        return float(words[0])
+    return math.nan
+
+
+def _track(rest: list[str]) -> NDArray[np.int64]:
+    with suppress(ValueError, OverflowError):
+        return np.array([int(word) for text in rest for word in text.split()], np.int64).reshape(-1, 2)
+    return NO_TRACK
+
+
+def _check_id(line: _Line, key: int, known: Mapping[int, object]) -> None:
     if not 0 <= key <= LARGEST_ID:
         line.refuse(f"an id from 0 to {LARGEST_ID}")
-    if not 0.0 < math.hypot(*quaternion) < math.inf:
-        line.refuse("a rotation, the quaternion QW QX QY QZ of length 1")
-    if camera not in cameras:
-        line.refuse(f"the id of a camera in cameras.txt, there is no {camera}")
-    names[key] = line.text.split(maxsplit=9)[9]
-    return key
-
-
-def _check_point(line: _Line, images: set[int]) -> int:
-    expected = "POINT3D_ID X Y Z R G B ERROR TRACK with finite numbers"
-    if len(line.words) < 8:
-        line.refuse(expected)
-    (key,) = line.numbers(int, line.words[:1], expected)
-    line.numbers(float, [*line.words[1:4], line.words[7]], expected)
-    if key < 0 or not all(0 <= channel <= 255 for channel in line.numbers(int, line.words[4:7], expected)):
-        line.refuse("a positive id and colours from 0 to 255")
-    track = line.numbers(int, line.words[8:], expected)
-    if len(track) % 2:
-        line.refuse("IMAGE_ID POINT2D_IDX for each image of the track")
-    if unknown := set(track[::2]) - images:
-        line.refuse(f"ids of images in images.txt, there is no {min(unknown)}")
-    return key
+    if key in known:
+        line.refuse(f"each id once, {key} was there before")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pycolmap
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
-from lapgs_plugin.scenes.colmap_binary import check_whole
+from lapgs_plugin.scenes.colmap_model import read_model
 
 SCENE_ENTRIES = frozenset({"images", "masks", "sparse"})
 """Entries of a scene folder. A folder with any other entry is never overwritten."""
@@ -99,7 +99,10 @@ def check_written(folder: Path) -> None:
     Raises:
         LapgsError: a file is incomplete.
     """
+    refusal = LapgsError(f"{folder}: the model is incomplete; check free space, then run the command again")
     try:
-        check_whole(folder)
+        damaged = read_model(folder).warnings
     except SceneError as error:
-        raise LapgsError(f"{folder}: the model is incomplete; check free space, then run the command again") from error
+        raise refusal from error
+    if damaged:
+        raise refusal

@@ -17,7 +17,7 @@ from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
-from lapgs_plugin.scenes.blender import has_transforms, read_transforms
+from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
@@ -228,6 +228,11 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
         )
     if (model := find_model(path)) is not None:
         source = read_colmap(path, model, images, evaluate)
+        if (count := count_frames(path)) not in (None, total := len(source.train) + len(source.test)):
+            line = (
+                f"{path / SINGLE_FILE} lists {counted(count, 'photo')} and {model} {total}, which are used, as in 3DGS"
+            )
+            source = replace(source, warnings=(*source.warnings, line))
     elif has_transforms(path):
         source = read_transforms(path, images, evaluate)
     else:

@@ -14,15 +14,24 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from plyfile import PlyData, PlyElement
 
 from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
 from lapgs_plugin.checkouts.script import loaded_script, require_script
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.cli import app
-from lapgs_plugin.errors import DeviceMemoryError, LapgsError, RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import (
+    DeviceMemoryError,
+    LapgsError,
+    RunFolderError,
+    SceneError,
+    TrainingDivergedError,
+    UserInputError,
+)
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.runner.installed_packages import explain_import_error
@@ -89,6 +98,18 @@ def test_a_scene_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"nowhere does not exist; give the script its folder") as caught:
         run_residuals(STUBS["graphdeco"], tmp_path / "nowhere", tmp_path / "run")
     one_line(caught.value)
+
+
+def test_a_scene_without_points_is_one_line(scene: Path, tmp_path: Path) -> None:
+    """AbsGS writes such a PLY from a model whose points have no tracks."""
+    shutil.copytree(scene, tmp_path / "scene")
+    ply = tmp_path / "scene" / "sparse" / "0" / "points3D.ply"
+    names = ("x", "y", "z", "red", "green", "blue")
+    PlyData([PlyElement.describe(np.empty(0, [(name, "f4") for name in names]), "vertex")]).write(str(ply))
+    with pytest.raises(SceneError, match=rf"{ply}: no points in it, expected the \d+ of the model; remove") as caught:
+        run_residuals(STUBS["graphdeco"], tmp_path / "scene", tmp_path / "run")
+    assert f"lapgs train {tmp_path / 'scene'}" in one_line(caught.value)
+    assert nothing_written(tmp_path / "run")
 
 
 def test_a_checkout_with_other_names_trains_to_the_same_bits(copy: Path, scene: Path, tmp_path: Path) -> None:

@@ -123,7 +123,7 @@ KINDS = (
     ),
     *(
         _scene(f"COLMAP {name} text", f"scene_txt/sparse/0/{name}.txt", _text)
-        for name in ("cameras", "images", "points3D")
+        for name in ("cameras", "images", "points3D", "rigs", "frames")
     ),
     *(
         _scene(f"photo {index} {suffix}", f"scene_{suffix}/photos/{index}.{suffix}", damage)

@@ -152,6 +152,9 @@ def _write_colmap(folder: Path, binary: bool) -> None:
     (model / "points3D.txt").write_text(
         "1 0.1 0.2 0.3 200 100 50 0.5 1 0 2 0 3 0\n2 -0.3 0.1 0.2 10 20 30 0.5 2 1 3 1\n"
     )
+    (model / "rigs.txt").write_text("1 1 CAMERA 1\n")
+    frames = [f"{index} 1 {' '.join(pose.split()[1:8])} 1 CAMERA 1 {index}" for index, pose in enumerate(poses[::2], 1)]
+    (model / "frames.txt").write_text("\n".join(frames) + "\n")
     if binary:
         pycolmap.Reconstruction(str(model)).write_binary(str(model))
         for text in model.glob("*.txt"):

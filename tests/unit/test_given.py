@@ -236,10 +236,56 @@ def test_a_larger_model_that_convert_py_leaves_distorted(tmp_path: Path, caplog:
     (tmp_path / "photos/images").rename(scene / "input")
     _without(pycolmap.Reconstruction(scene / "sparse/0"), {"c.png", "e.png", "right/d.png"}, scene / "sparse/0")
     assert len(load_scene(scene, progress=False).train) == 2
-    expected = f"sparse/0 places 2 photos and {scene / 'distorted/sparse/1'} 5; make a scene of the latter with `lapgs"
-    assert expected in caplog.text
-    assert _run(scene, tmp_path / "out").registered == tuple(sorted(PHOTOS))
+    larger = scene / "distorted/sparse/1"
+    expected = f"sparse/0 places 2 photos and {larger} 5; make a scene of the latter with `lapgs prepare {scene} OUT"
+    assert f"{expected} --model {larger}`" in caplog.text
+    assert len(_run(scene, tmp_path / "smaller", max_size=64).registered) == 2  # what `lapgs train` reads
+    assert _run(scene, tmp_path / "out", model=larger).registered == tuple(sorted(PHOTOS))
     _check_images(tmp_path / "out", 0.01)
+
+
+def test_observations_that_do_not_fit_are_left_out(tmp_path: Path) -> None:
+    scene, place = _scene(tmp_path / "scene"), tmp_path / "edited"
+    place.mkdir()
+    _model().write_text(place)
+    points = place / "points3D.txt"
+    *comments, first, second, third = points.read_text().splitlines()[: 3 + 3]
+    taken = "31 0 0 5 1 2 3 0 1 1 2 1"  # features of the second point
+    points.write_text("\n".join([*comments, f"{first} 99 0 1 77 1 -1", second, f"{third} 1", taken]))
+    result = _run(scene, tmp_path / "out", model=place)
+    assert result.points == 4
+    model = _check_images(tmp_path / "out", 0.01)
+    assert sorted(len(point.track.elements) for point in model.points3D.values()) == [0, 0, 5, 5]
+    assert [image.num_points3D for image in model.images.values()] == [2] * 5
+
+
+def test_frames_that_were_removed_from_a_transforms_file_stay_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The file is what `lapgs train` reads; the points of the COLMAP model are moved to its world."""
+    scene = _transforms(tmp_path / "scene")
+    (scene / "colmap/sparse/0").mkdir(parents=True)
+    turn, shift, scale = cv2.Rodrigues(np.array([0.3, -1.0, 0.4]))[0], np.array([3.0, -2.0, 7.0]), 2.5
+    model = _model()
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), shift))
+    model.write_binary(scene / "colmap/sparse/0")
+    values = json.loads((scene / "transforms.json").read_text())
+    removed = values["frames"].pop(2)["file_path"]
+    (scene / "transforms.json").write_text(json.dumps(values))
+    result = _run(scene, tmp_path / "out")
+    assert removed.removeprefix("images/") not in result.registered
+    assert len(result.registered) == 4
+    assert "transforms.json lists 4 photos and" in caplog.text
+    assert f"those of {scene}/colmap/sparse/0 are used" in caplog.text
+    written = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    points = sorted(tuple(point.xyz) for point in written.points3D.values())
+    np.testing.assert_allclose(points, sorted(map(tuple, POINTS)), rtol=0, atol=1e-9)  # seen 4e-15
+    everything = _run(scene, tmp_path / "all", model=scene / "colmap/sparse/0")
+    assert everything.registered == tuple(sorted(PHOTOS))
+    for frame in values["frames"][:2]:  # another world, bent
+        frame["transform_matrix"][0][3] += 0.5
+    (scene / "transforms.json").write_text(json.dumps(values))
+    assert _run(scene, tmp_path / "bent").points == 100_000
 
 
 def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from lapgs_plugin.errors import FieldError, SceneError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
 from lapgs_plugin.fields.ply import read_ply
 from lapgs_plugin.scenes import blender
+from lapgs_plugin.scenes.point_cloud import read_point_cloud
 from tests.cli.run_folder import write_scene
 
 ASCII, BINARY = "format ascii 1.0", "format binary_little_endian 1.0"
@@ -62,7 +63,7 @@ def test_damage_is_one_line_for_fields_and_for_points(name: str, tmp_path: Path)
             assert "\n" not in str(caught.value)
             assert str(path) in str(caught.value)
         with pytest.raises(SceneError, match=message) as refused:
-            blender._read_points(tmp_path, "transforms.json", {})
+            read_point_cloud(tmp_path / "points3d.ply", str(tmp_path / "points3d.ply"))
         assert "\n" not in str(refused.value)
         assert tracemalloc.get_traced_memory()[1] < 50 * 2**20  # 3 MiB seen
     finally:
@@ -104,7 +105,7 @@ def test_points_need_numbers(elements: str, message: str, tmp_path: Path) -> Non
     )
     (tmp_path / "points3d.ply").write_bytes(ply(ASCII, f"element vertex 1\n{elements}", f"{row}\n".encode()))
     with pytest.raises(SceneError, match=message):
-        blender._read_points(tmp_path, "transforms.json", {})
+        read_point_cloud(tmp_path / "points3d.ply", str(tmp_path / "points3d.ply"))
 
 
 def test_a_scene_with_damaged_points_is_one_line(tmp_path: Path) -> None:

@@ -384,14 +384,16 @@ def test_a_ply_that_is_not_there_is_told(tmp_path: Path, name: str, caplog: pyte
     assert "no such file; training starts from random points" in caplog.text
 
 
-def test_points_with_float_colors_or_none(tmp_path: Path) -> None:
+def test_points_with_float_colors_or_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = capture(tmp_path)
     points = np.random.default_rng(0).normal(size=(5, 3))
     colors = np.random.default_rng(1).random((5, 3)).astype(np.float32)
     write_ply(path / "points3d.ply", points, colors)
     np.testing.assert_allclose(load(path).colors.numpy(), colors, atol=1e-7)  # 0 seen
     write_ply(path / "points3d.ply", points, None)
+    assert not caplog.records
     assert bool((load(path).colors == 0.5).all())
+    assert "points3d.ply: no colours among x, y, z; its points start grey" in caplog.text
 
 
 def test_random_points_of_a_blender_scene_fill_3dgs_cube(tmp_path: Path) -> None:

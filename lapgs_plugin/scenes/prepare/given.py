@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import repeat
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shlex import quote
 
 import numpy as np
 import pycolmap
@@ -14,8 +16,10 @@ import pycolmap
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
-from lapgs_plugin.scenes.blender import FISHEYE, Lenses, has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, largest_model, read_model, source_of
+from lapgs_plugin.scenes.blender import FISHEYE, SINGLE_FILE, Lenses, has_transforms, read_transforms
+from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, is_straight, larger_model, largest_model, source_of
+from lapgs_plugin.scenes.colmap_model import Model, count_images, read_model
+from lapgs_plugin.scenes.colmap_records import NO_FEATURES, NO_TRACK, Points, PosedImage
 from lapgs_plugin.scenes.images import find_image, image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
@@ -69,20 +73,28 @@ class Given:
 def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
     """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
 
-    Of several models the largest is taken.
+    It is what `lapgs train` reads, if it can be trained on. Of several distorted models the largest is taken.
 
     Raises:
         UserInputError: --model names none.
+        SceneError: the model cannot be read.
     """
-    if settings.model is None:
-        if (found := find_model(photos, MODEL_PLACES)) is not None:
-            return largest_model(photos, found)
-        return photos if has_transforms(photos) else None
-    if (found := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
-        raise UserInputError(
-            f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and points3D"
-        )
-    return largest_model(settings.model, found)
+    if settings.model is not None:
+        if (named := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
+            raise UserInputError(
+                f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and "
+                "points3D"
+            )
+        return largest_model(settings.model, named)
+    trained = find_model(photos)
+    if trained is None and has_transforms(photos):
+        return photos
+    if trained is not None and is_straight(read_model(trained)):
+        for line in larger_model(photos, trained):
+            logger.warning(line)
+        return trained
+    found = trained or find_model(photos, MODEL_PLACES)
+    return None if found is None else largest_model(photos, found)
 
 
 def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
@@ -105,10 +117,9 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
             )
     transforms = find_model(place, (".",)) is None
     if not transforms:
-        model = _without_rigs(read_model(place))
-        model.tear_down()  # of images without a pose, and cameras without images
-        _check_lenses(model, place)
-        source = source_of(model, place, photos)
+        model = read_model(place, observations=True)
+        _check_lenses(model)
+        source = source_of(model, photos)
         folder = max((photos / name for name in FOLDERS), key=lambda folder: _fit(source, folder))
         frames = [replace(frame, path=find_image(folder / frame.name)) for frame in source.train]
     else:
@@ -116,15 +127,22 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         source, folder = read_transforms(photos, "images", False, lenses), photos
         top = common_folder([frame.name for frame in source.train])
         frames = [replace(frame, name=frame.name.removeprefix(top)) for frame in source.train]
-        model = _model_of(replace(source, train=tuple(frames)), lenses)
-        _check_lenses(model, place)
+        model = _model_of(place, replace(source, train=tuple(frames)), lenses)
+        other = find_model(photos, MODEL_PLACES)
+        if other is not None and (count := count_images(other)) != len(frames):
+            logger.warning(
+                "%s lists %d photos and %s %d; those of the former are used, as by `lapgs train`; --model %s takes the "
+                "latter",
+                *(photos / SINGLE_FILE, len(frames), other, count, quote(str(other))),
+            )
+        _check_lenses(model)
     there = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
     if frames and not there:
         advice = "put them there" if transforms else "give the folder of the photos, and the model with --model"
         first = min(frame.path for frame in frames)
         raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
-    kinds = {camera.model.name for camera in model.cameras.values()}
+    kinds = {model.cameras[image.camera_id].model.name for image in model.images.values()}
     as_it_is = (transforms or place == find_model(photos)) and not left_out and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}
     if settings.max_size is None and as_it_is:
         raise UserInputError(
@@ -137,15 +155,13 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
         logger.warning(warning)
     if left_out:
         logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
-    frame_of = {image.name: image.frame_id for image in model.images.values()}
-    for name in left_out:
-        model.deregister_frame(frame_of[name])
     logger.info("%s: the cameras are taken from it", place)
     masks = settings.masks
     if masks is None and (found := resolve_masks(photos, AUTO)) != NONE:
         masks = photos / found
     files = {frame.name: frame.path for frame in there}
-    return Given(model, there, Photos(folder, files), tuple(left_out), replace(settings, masks=masks, model=place))
+    settings = replace(settings, masks=masks, model=place)
+    return Given(_reconstruction(model, files), there, Photos(folder, files), tuple(left_out), settings)
 
 
 def _fit(source: SceneSource, folder: Path) -> tuple[int, bool]:
@@ -157,42 +173,60 @@ def _fit(source: SceneSource, folder: Path) -> tuple[int, bool]:
     return len(there), any(image_size(file) == frame.camera.size for file, frame in there[:1])
 
 
-def _without_rigs(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Return the model with a pose of its own for each image: images of a rig cannot be left out or turned alone."""
-    if all(rig.num_sensors() == 1 for rig in model.rigs.values()):
-        return model
-    with TemporaryDirectory() as folder:
-        model.write_binary(folder)
-        for name in ("rigs.bin", "frames.bin"):
-            (Path(folder) / name).unlink()
-        return pycolmap.Reconstruction(folder)
-
-
-def _check_lenses(model: pycolmap.Reconstruction, place: Path) -> None:
-    for key, camera in model.cameras.items():
-        who = f"{place}: camera {key} ({camera.model.name})"
+def _check_lenses(model: Model) -> None:
+    for key in sorted({image.camera_id for image in model.images.values()}):
+        camera = model.cameras[key]
+        who = f"{model.folder}: camera {key} ({camera.model.name})"
         if camera.model.name == ALL_AROUND:
             raise SceneError(f"{who}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
 
 
-def _model_of(source: SceneSource, lenses: Lenses) -> pycolmap.Reconstruction:
+def _model_of(place: Path, source: SceneSource, lenses: Lenses) -> Model:
     """Return frames and points of a transforms file as a model of COLMAP."""
-    model, cameras = pycolmap.Reconstruction(), dict[str, int]()
+    cameras: dict[str, pycolmap.Camera] = {}
+    images: dict[int, PosedImage] = {}
     for number, frame in enumerate(source.train, start=1):
         camera = frame.camera
         kind, distortion = _colmap_lens(frame, *lenses[frame.path])
         values = [camera.fx, camera.fy, camera.cx, camera.cy, *distortion]
         lens = pycolmap.Camera(model=kind, width=camera.width, height=camera.height, params=values)
-        lens.camera_id = cameras.setdefault(repr((camera.size, kind, values)), len(cameras) + 1)
-        if lens.camera_id not in model.cameras:
-            model.add_camera_with_trivial_rig(lens)
-        image = pycolmap.Image(name=frame.name, camera_id=lens.camera_id, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera.numpy()[:3]))
-    for point, color in zip(source.points, source.colors.clip(0.0, 1.0) * 255.0, strict=True):
-        model.add_point3D(point, pycolmap.Track(), np.rint(color).astype(np.uint8))
-    return model
+        lens.camera_id = len(cameras) + 1
+        key = cameras.setdefault(repr((camera.size, kind, values)), lens).camera_id
+        pose = camera.world_to_camera.numpy()
+        x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
+        images[number] = PosedImage(frame.name, key, np.array([w, x, y, z, *pose[:3, 3]]), NO_FEATURES)
+    by_id = {camera.camera_id: camera for camera in cameras.values()}
+    return Model(place, by_id, images, Points(source.points, 255.0 * source.colors))
+
+
+def _reconstruction(model: Model, names: Collection[str]) -> pycolmap.Reconstruction:
+    """Return the images of these names and all points, with the observations that tracks and features agree on.
+
+    Each image has a pose of its own: those of a rig could neither be left out nor turned alone.
+    """
+    result = pycolmap.Reconstruction()
+    images = {key: image for key, image in model.images.items() if image.name in names}
+    for key in sorted({image.camera_id for image in images.values()}):
+        result.add_camera_with_trivial_rig(model.cameras[key])
+    for key, image in images.items():
+        observed = pycolmap.Image(image.name, keypoints=image.features, camera_id=image.camera_id, image_id=key)
+        result.add_image_with_trivial_frame(observed, image.pose)
+    free = {key: np.ones(len(image.features), bool) for key, image in images.items()}
+    points, colors = model.points, np.rint(model.points.rgb.clip(0, 255)).astype(np.uint8)
+    errors = points.errors or repeat(math.nan, len(colors))
+    tracks = points.tracks or repeat(NO_TRACK, len(colors))
+    for xyz, color, error, track in zip(points.xyz, colors, errors, tracks, strict=True):
+        elements = pycolmap.Track()
+        for key, feature in track:
+            if key in free and 0 <= feature < len(free[key]) and free[key][feature]:
+                free[key][feature] = False
+                elements.add_element(key, feature)
+        key = result.add_point3D(xyz, elements, color)
+        if error >= 0:
+            result.points3D[key].error = error
+    return result
 
 
 def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> tuple[str, list[float]]:

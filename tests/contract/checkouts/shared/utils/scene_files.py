@@ -36,8 +36,18 @@ def read_scene_files(path, images, eval):
         source = read_colmap(Path(path), model, images or "images", eval)
     else:
         source = read_transforms(Path(path), "images", eval)
+    points = BasicPointCloud(source.points, source.colors, np.zeros_like(source.points))
+    if model is not None and Path(model, "points3D.ply").is_file():
+        points = fetchPly(Path(model, "points3D.ply"))
     train, test = ([posed_file(frame) for frame in frames] for frames in (source.train, source.test))
-    return SceneFiles(BasicPointCloud(source.points, source.colors, np.zeros_like(source.points)), train, test)
+    return SceneFiles(points, train, test)
+
+
+def fetchPly(path):
+    vertices = PlyData.read(str(path))["vertex"]
+    columns = (np.stack([vertices[name] for name in names], 1) for names in ("xyz", ("red", "green", "blue")))
+    points, colors = columns
+    return BasicPointCloud(points, colors / 255.0, np.zeros_like(points))
 
 
 def posed_file(frame):

@@ -1,0 +1,173 @@
+"""Read sparse models of COLMAP as codebases of 3DGS do: cameras, images and points are the truth.
+
+Other files of a model may be outdated, because scripts that edit models do not know them. A line says so.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from lapgs_plugin.errors import SceneError, counted
+from lapgs_plugin.files import is_file
+from lapgs_plugin.scenes import colmap_binary, colmap_text
+from lapgs_plugin.scenes.colmap_frames import frame_poses
+from lapgs_plugin.scenes.colmap_records import Points, PosedImage
+from lapgs_plugin.scenes.point_cloud import read_point_cloud
+
+MODEL_FILES = ("cameras", "images", "points3D")
+
+SAME = 1e-6
+"""Largest difference of equal numbers in two files, as a share of the largest one."""
+
+ADVICE = {
+    **dict.fromkeys(
+        ("frames.bin", "frames.txt"), "COLMAP uses the frames, remove them and the rigs if they are outdated"
+    ),
+    "points3D.ply": "codebases of 3DGS use the PLY, remove it if it is outdated",
+}
+"""What to do about files that other programs prefer."""
+
+_Entries = Mapping[Hashable, NDArray[np.float64]]
+"""What a file says of cameras, images or points, to compare with another file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A sparse model: its cameras and images by id, and its points.
+
+    Attributes:
+        folder: of its files.
+        cameras: those of the images, and maybe others.
+        images: in the order of the file.
+        points: without tracks unless they were asked for.
+        warnings: a line for each file that says something else.
+    """
+
+    folder: Path
+    cameras: dict[int, pycolmap.Camera]
+    images: dict[int, PosedImage]
+    points: Points
+    warnings: tuple[str, ...] = ()
+
+
+def read_model(folder: Path, observations: bool = False) -> Model:
+    """Read the COLMAP model in a folder, binary or text.
+
+    Args:
+        folder: of the files.
+        observations: read features and tracks, too.
+
+    Raises:
+        SceneError: it is incomplete or unreadable.
+    """
+    suffix, points = _formats(folder)
+    reader = colmap_binary if suffix == "bin" else colmap_text
+    cameras = reader.read_cameras(folder / f"cameras.{suffix}")
+    images = reader.read_images(folder / f"images.{suffix}", observations)
+    for key, image in images.items():
+        if image.camera_id not in cameras:
+            raise SceneError(
+                f"{folder}: image {key} ({image.name}) of images.{suffix} has camera {image.camera_id}, expected one "
+                f"of cameras.{suffix}; copy or export the model again"
+            )
+    model = Model(folder, cameras, images, _read_points(points[0], observations))
+    return replace(model, warnings=tuple(_contradictions(model, suffix, points)))
+
+
+def count_images(folder: Path) -> int:
+    """Return how many images a model has; 0 of other folders, and where the file of images is damaged."""
+    with suppress(SceneError, OSError):
+        suffix, _ = _formats(folder)
+        images = folder / f"images.{suffix}"
+        return colmap_binary.count_images(images) if suffix == "bin" else len(colmap_text.read_images(images))
+    return 0
+
+
+def _formats(folder: Path) -> tuple[str, list[Path]]:
+    """Return the suffix of a model's cameras and images, and the files of its points, the one to read first.
+
+    Raises:
+        SceneError: one is missing.
+    """
+    points = [file for suffix in ("bin", "txt", "ply") if is_file(file := folder / f"points3D.{suffix}")]
+    for suffix in ("bin", "txt"):
+        if points and all(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES[:2]):
+            return suffix, points
+    present = ", ".join(sorted(entry.name for entry in folder.iterdir() if entry.stem in MODEL_FILES))
+    raise SceneError(
+        f"{folder}: the sparse model is incomplete, it has only {present}; "
+        "expected cameras, images and points3D, all as .bin or all as .txt"
+    )
+
+
+def _read_points(file: Path, observations: bool = False) -> Points:
+    if file.suffix == ".ply":
+        cloud = read_point_cloud(file, f"{file}")
+        return Points(cloud.xyz, 255.0 * cloud.rgb)
+    if file.suffix == ".bin":
+        return colmap_binary.read_points(file, observations)
+    return colmap_text.read_points(file, observations)
+
+
+def _contradictions(model: Model, suffix: str, points: list[Path]) -> Iterator[str]:
+    """Yield a line for each file beside those of a model that says something else."""
+    folder = model.folder
+    others = [(folder / f"frames.{suffix}", f"images.{suffix}"), *((file, points[0].name) for file in points[1:])]
+    if suffix == "bin":  # text was exported to be read, or to be edited
+        others += [(folder / f"{name}.txt", f"{name}.bin") for name in MODEL_FILES[:2]]
+    for file, used in others:
+        if not is_file(file):
+            continue
+        try:
+            what = _difference(model, file, suffix)
+        except (SceneError, ValueError, LookupError, ArithmeticError, OSError, struct.error):
+            what = "damaged, or of another model than"
+        if what:
+            advice = ADVICE.get(file.name, "remove it if it is outdated")
+            yield f"{file}: {what} {used}, which is used; {advice}"
+
+
+def _difference(model: Model, file: Path, suffix: str) -> str:
+    """Return what a file says otherwise than a model, or ""."""
+    if file.stem == "points3D":
+        count, own = len(_read_points(file).xyz), len(model.points.xyz)
+        return "" if count == own else f"{counted(count, 'point')} in place of the {own} of"
+    if file.stem == "cameras":
+        return _differing(_lenses(model.cameras), _lenses(colmap_text.read_cameras(file)))
+    if file.stem == "images":
+        return _differing(_poses(model.images), _poses(colmap_text.read_images(file)))
+    poses, images = frame_poses(model.folder, suffix), model.images
+    return _differing(
+        _poses(images), {images[key].name if key in images else str(key): pose.matrix() for key, pose in poses.items()}
+    )
+
+
+def _differing(own: _Entries, others: _Entries) -> str:
+    names = [name for name in own.keys() | others.keys() if not _same(own.get(name), others.get(name))]
+    return f"{len(names)} of {max(len(own), len(others))} entries differ from" if names else ""
+
+
+def _same(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> bool:
+    if one is None or other is None or one.shape != other.shape:
+        return False
+    with np.errstate(invalid="ignore"):  # inf - inf
+        return bool(np.abs(one - other).max() <= SAME * np.abs(one).max())
+
+
+def _poses(images: Mapping[int, PosedImage]) -> _Entries:
+    return {image.name: image.pose.matrix() for image in images.values() if image.has_rotation}
+
+
+def _lenses(cameras: Mapping[int, pycolmap.Camera]) -> _Entries:
+    return {
+        key: np.array([camera.model.value, camera.width, camera.height, *camera.params], np.float64)
+        for key, camera in cameras.items()
+    }
