@@ -28,8 +28,7 @@ def frame_poses(folder: Path, suffix: str) -> dict[int, pycolmap.Rigid3d]:
     """Return the poses of images, world to camera, by id.
 
     Raises:
-        ValueError, LookupError, ArithmeticError, OSError, struct.error: a file is damaged or missing, or the two do not
-            agree.
+        ValueError, LookupError, ArithmeticError, OSError, struct.error: a file is damaged or missing.
     """
     rigs, frames = (folder / f"{name}.{suffix}" for name in ("rigs", "frames"))
     sensors: dict[tuple[float, ...], pycolmap.Rigid3d] = {}  # by rig, type and id
@@ -46,7 +45,7 @@ def frame_poses(folder: Path, suffix: str) -> dict[int, pycolmap.Rigid3d]:
         _, rig, pose = take("I"), take("I"), _pose(take)
         for _ in range(int(take("I"))):
             sensor, data = (rig, take("i"), take("I")), int(take("Q"))
-            if sensor[1] == SENSORS["CAMERA"]:
+            if sensor[1] == SENSORS["CAMERA"] and sensor in sensors:
                 poses[data] = sensors[sensor] * pose
     return poses
 

@@ -29,9 +29,9 @@ SAME = 1e-6
 
 ADVICE = {
     **dict.fromkeys(
-        ("frames.bin", "frames.txt"), "COLMAP uses the frames, remove them and the rigs if they are outdated"
+        ("frames.bin", "frames.txt"), "COLMAP uses the frames: remove them and the rigs if they are outdated"
     ),
-    "points3D.ply": "codebases of 3DGS use the PLY, remove it if it is outdated",
+    "points3D.ply": "codebases of 3DGS use the PLY: remove it if it is outdated",
 }
 """What to do about files that other programs prefer."""
 
@@ -129,17 +129,17 @@ def _contradictions(model: Model, suffix: str, points: list[Path]) -> Iterator[s
         try:
             what = _difference(model, file, suffix)
         except (SceneError, ValueError, LookupError, ArithmeticError, OSError, struct.error):
-            what = "damaged, or of another model than"
+            what = "damaged"
         if what:
-            advice = ADVICE.get(file.name, "remove it if it is outdated")
-            yield f"{file}: {what} {used}, which is used; {advice}"
+            advice = ADVICE.get(file.name, "remove this one if it is outdated")
+            yield f"{file}: {what}; {used} is used, {advice}"
 
 
 def _difference(model: Model, file: Path, suffix: str) -> str:
     """Return what a file says otherwise than a model, or ""."""
     if file.stem == "points3D":
         count, own = len(_read_points(file).xyz), len(model.points.xyz)
-        return "" if count == own else f"{counted(count, 'point')} in place of the {own} of"
+        return "" if count == own else f"{counted(count, 'point')} in place of {own}"
     if file.stem == "cameras":
         return _differing(_lenses(model.cameras), _lenses(colmap_text.read_cameras(file)))
     if file.stem == "images":
@@ -152,7 +152,7 @@ def _difference(model: Model, file: Path, suffix: str) -> str:
 
 def _differing(own: _Entries, others: _Entries) -> str:
     names = [name for name in own.keys() | others.keys() if not _same(own.get(name), others.get(name))]
-    return f"{len(names)} of {max(len(own), len(others))} entries differ from" if names else ""
+    return f"{len(names)} of {max(len(own), len(others))} entries differ" if names else ""
 
 
 def _same(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> bool:

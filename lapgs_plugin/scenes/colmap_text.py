@@ -99,7 +99,7 @@ def read_cameras(file: Path) -> dict[int, pycolmap.Camera]:
         _check_id(line, key, cameras)
         if min(width, height) < 1:
             line.refuse(f"{CAMERA} with positive numbers")
-        model = line.words[1]
+        model = line.words[1].upper()
         if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
             line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
         camera = pycolmap.Camera.create_from_model_name(key, model, 1.0, 1, 1)

@@ -208,7 +208,7 @@ def test_poses_are_those_of_the_images_not_of_the_frames(tmp_path: Path, kind: s
     else:
         (line,) = read.warnings
         what = "damaged" if edit == "cut" else "2 of 4 entries"
-        assert re.search(rf"frames\.{kind}: {what}.* images\.{kind}, which is used; COLMAP uses the frames", line)
+        assert re.search(rf"frames\.{kind}: {what}.*; images\.{kind} is used, COLMAP uses the frames", line)
 
 
 def test_text_beside_binary_files(tmp_path: Path) -> None:
@@ -224,12 +224,12 @@ def test_text_beside_binary_files(tmp_path: Path) -> None:
         ("images", "b.png", "c.png", "2 of 4 entries"),
         ("images", "4.0 ", "4.5 ", "1 of 4 entries"),
         ("images", r" 1 b\.png", "", "damaged"),
-        ("points3D", r"^1 .*\n", "", "39 points in place of the 40"),
+        ("points3D", r"^1 .*\n", "", "39 points in place of 40"),
     ):
         file = folder / f"{name}.txt"
         file.write_text(re.sub(old, new, texts[file], count=1))
         (line,) = read_model(folder).warnings
-        assert re.search(rf"{name}\.txt: {what}.* {name}\.bin, which is used; remove it", line)
+        assert re.search(rf"{name}\.txt: {what}.*; {name}\.bin is used, remove", line)
         file.write_text(texts[file])
     (folder / "images.bin").unlink()
     (folder / "images.txt").write_text(texts[folder / "images.txt"].replace("b.png", "c.png"))
@@ -256,7 +256,7 @@ def test_a_ply_beside_the_points_is_for_codebases(tmp_path: Path) -> None:
     source = read_colmap(path, file.parent, "images", evaluate=False)
     assert len(source.points) == len(POINTS)
     (line,) = source.warnings
-    assert f"{file}: 0 points in place of the 40 of points3D.bin, which is used; codebases of 3DGS use the PLY" in line
+    assert f"{file}: 0 points in place of 40; points3D.bin is used, codebases of 3DGS use the PLY" in line
     assert f"{file}: no points in it, expected the 40 of the model; remove the file" in why_no_points(path)
     (file.parent / "points3D.bin").unlink()
     write_ply(file, POINTS, COLORS.astype(np.uint8))
