@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import inspect
+import os
 import random
+import tempfile
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -17,7 +19,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runs.image_store import eight_bit_levels
+from lapgs_plugin.files import one_line_errors
+from lapgs_plugin.runs.image_store import eight_bit_levels, tensor_bytes
 from lapgs_plugin.scenes.masks import ALPHA, NONE, find_masks, read_mask, resolve_masks
 
 KEY = "lapgs_key"
@@ -41,33 +44,61 @@ DEPTH_MAPS = {"invdepthmap", "depth_mask"}
 """Maps of cameras by which depth is supervised."""
 
 
+Keep = Callable[[Tensor], Callable[[], Tensor]]
+"""Keep a tensor of the CPU, and return a function that returns it."""
+
+
 @dataclass(frozen=True)
 class FullSizeImage:
-    """Hold a full-size image (3, h, w) on the CPU: uint8 if all values are k/255, otherwise float16."""
+    """Hold a full-size image (3, h, w) on the CPU: uint8 if all values are k/255, otherwise float16.
 
-    stored: Tensor  # (3, h, w)
+    Attributes:
+        size: (width, height).
+        exact: whether it is an 8-bit image, stored without rounding.
+        stored: returns it as it is stored.
+    """
+
+    size: tuple[int, int]
+    exact: bool
+    stored: Callable[[], Tensor]  # (3, h, w)
 
     @classmethod
-    def of(cls, image: Tensor) -> FullSizeImage:
+    def of(cls, image: Tensor, keep: Keep) -> FullSizeImage:
         """Return the image for values (3, h, w) in [0, 1]."""
-        if (levels := eight_bit_levels(image)) is not None:
-            return cls(levels.cpu())
-        return cls(image.to("cpu", torch.float16))
-
-    @property
-    def exact(self) -> bool:
-        """Whether it is an 8-bit image, stored without rounding."""
-        return self.stored.dtype == torch.uint8
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height)"""
-        return self.stored.shape[2], self.stored.shape[1]
+        levels = eight_bit_levels(image)
+        stored = image.to(torch.float16) if levels is None else levels
+        return cls((image.shape[2], image.shape[1]), levels is not None, keep(stored.cpu()))
 
     def load(self, device: torch.device) -> Tensor:
         """Return the image (3, h, w) in [0, 1] on a device, float32."""
-        moved = self.stored.to(device)
+        moved = self.stored().to(device)
         return moved / 255 if self.exact else moved.float()
+
+
+class _NamelessFile:
+    """Keep tensors in a file without a name, which ends with the process, however that ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._lock = folder, threading.Lock()
+        with one_line_errors(folder):
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # held as long as this object
+
+    def keep(self, tensor: Tensor) -> Callable[[], Tensor]:
+        """Append a tensor; see `Keep`."""
+        shape, dtype, data = tensor.shape, tensor.dtype, tensor_bytes(tensor.contiguous())
+        with self._lock, one_line_errors(self._folder):
+            start = self._file.seek(0, os.SEEK_END)
+            self._file.write(data)
+            self._file.flush()
+
+        def read() -> Tensor:
+            stored = torch.empty(shape, dtype=dtype)
+            with self._lock, one_line_errors(self._folder, "read"):
+                self._file.seek(start)
+                self._file.readinto(tensor_bytes(stored))
+            return stored
+
+        return read
 
 
 class SceneImages:
@@ -75,15 +106,23 @@ class SceneImages:
 
     Keys are unique even if names are not: Blender scenes have an r_0 for training and another for testing.
 
-    Attributes:
-        masks: (1, h, w) bool by key, False where the image is ignored; empty without masks.
+    They are kept in memory, unless `keep_on_disk` is called first.
     """
 
     def __init__(self) -> None:
+        self._keep: Keep = lambda tensor: lambda: tensor
         self._images: dict[str, FullSizeImage] = {}
         # Some checkouts make their cameras in several threads.
         self._making, self._lock = threading.local(), threading.Lock()
-        self.masks: dict[str, Tensor] = {}
+        self._masks: dict[str, Callable[[], Tensor]] = {}
+
+    def keep_on_disk(self, folder: Path) -> None:
+        """Keep images and masks in a file that nobody sees, on the disk of a folder that exists.
+
+        Raises:
+            RunFolderError: the folder cannot be written. Later: its disk is full.
+        """
+        self._keep = _NamelessFile(folder).keep
 
     def adopting(self, original: Callable[..., None]) -> Callable[..., None]:
         """Return a replacement of a camera class's `__init__` that takes the image out of every camera it makes."""
@@ -113,7 +152,7 @@ class SceneImages:
                 f"image {camera.image_name}: the checkout reads {channels} channel(s) of it, expected 3; save the "
                 "scene's images as RGB"
             )
-        stored = FullSizeImage.of(image)
+        stored = FullSizeImage.of(image, self._keep)
         with self._lock:
             key = f"{len(self._images):05d}-{camera.image_name}"
             self._images[key] = stored
@@ -135,7 +174,16 @@ class SceneImages:
             return
         files = find_masks(scene / resolved, [view_name(key) for key in self._images])
         for key, image in self._images.items():
-            self.masks[key] = read_mask(files[view_name(key)], image.size, image.size)
+            self._masks[key] = self._keep(read_mask(files[view_name(key)], image.size, image.size))
+
+    @property
+    def masked(self) -> bool:
+        """Whether images have masks."""
+        return bool(self._masks)
+
+    def mask(self, key: str) -> Tensor | None:
+        """Return a view's mask (1, h, w) bool, False where the image is ignored; None without masks."""
+        return self._masks[key]() if self._masks else None
 
     @property
     def exact(self) -> bool:

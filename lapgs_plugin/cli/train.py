@@ -213,7 +213,7 @@ def _resume(
                 raise
             raise UserInputError(f"{archive.path(MANIFEST)}: {error}") from error
         with errors_about(archive.path(MANIFEST)):
-            loaded = load_reference(replace(manifest.scene, path=str(scene)))
+            loaded = load_reference(replace(manifest.scene, path=str(scene)), hold=settings.images_on != "disk")
         require_same_scene(archive, scene, loaded.smallest_size)
         with errors_about(archive.path(MANIFEST)):
             make_plan(loaded.smallest_size, settings, len(loaded.train))
@@ -299,7 +299,7 @@ def _create(
         chosen = (_for_photos(photos, settings) if choose_iterations else settings).for_size(size)
         require_pruning(make_plan(size, chosen, photos), chosen)
 
-    loaded = load_reference(reference, check)
+    loaded = load_reference(reference, check, hold=settings.images_on != "disk")
     found = replace(reference, path=str(Path(reference.path).absolute()), kind=loaded.kind)
     manifest = Manifest(scene=found, rasterizer=rasterizer, **chosen.for_manifest())
     return RunArchive.create(out, manifest, overwrite), loaded, chosen
@@ -371,11 +371,10 @@ def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:
     """Print the share of the pixels inside masks, if there are masks."""
     from lapgs_plugin.scenes.masks import share_inside
 
-    masks = [view.mask for view in (*scene.train, *scene.test)]
-    if any(mask is not None for mask in masks):
-        console.print(
-            f"masks ({masks_from}): {share_inside(masks):.0%} of the pixels are trained on and measured", markup=False
-        )
+    views = (*scene.train, *scene.test)
+    if any(view.masked for view in views):
+        share = share_inside(view.mask for view in views)
+        console.print(f"masks ({masks_from}): {share:.0%} of the pixels are trained on and measured", markup=False)
 
 
 def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:

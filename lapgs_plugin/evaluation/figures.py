@@ -121,7 +121,7 @@ def evaluate_run(
         "versions": versions(),
         "lpips_missing": dict(distances.missing),
         "fps": speed.fps,
-        "masked": any(view.mask is not None for view in photos),
+        "masked": any(view.masked for view in photos),
         "exposure_compensated": learned is not None,
         "exposure_predicted": bool(exposures),
     }
@@ -144,12 +144,12 @@ def _measure_view(
     if exposure is not None:
         transform = exposure.to(renderer.device)
         composed = {level: transform_colors(image, transform) for level, image in composed.items()}
-    photo, mask = view.image.to(renderer.device), None
+    photo, mask = view.image.to(renderer.device), view.mask
     targets: list[tuple[Tensor, Tensor | None]]
-    if view.mask is None:
+    if mask is None:
         targets = [(each, None) for each in renderer.pyramid.gaussian(photo, renderer.levels)]
     else:
-        mask = view.mask.to(renderer.device)
+        mask = mask.to(renderer.device)
         targets = [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]
     levels = {
         level: {

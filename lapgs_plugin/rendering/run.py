@@ -46,8 +46,10 @@ def run_renderer(
     return HierarchyRenderer.from_archive(archive, placed.rasterizer, placed.device, finest=finest)
 
 
-def load_reference(reference: SceneReference, check: Callable[[tuple[int, int], int], None] | None = None) -> Scene:
-    """Load the scene that a manifest names, and read it as the manifest says; `check` as `load_scene` takes it."""
+def load_reference(
+    reference: SceneReference, check: Callable[[tuple[int, int], int], None] | None = None, hold: bool = True
+) -> Scene:
+    """Load the scene that a manifest names, and read it as the manifest says; `check`, `hold` as `load_scene`."""
     return load_scene(
         reference.path,
         resolution=reference.resolution,
@@ -56,11 +58,12 @@ def load_reference(reference: SceneReference, check: Callable[[tuple[int, int], 
         masks=reference.masks,
         background=reference.background,
         check=check,
+        hold=hold,
     )
 
 
 def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
-    """Load the scene of a run with the settings of the training.
+    """Load the scene of a run with the settings of the training. Its images are read when they are used.
 
     Args:
         archive: the run.
@@ -78,7 +81,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
             f"put them back{otherwise}"
         )
     with _errors_about_scene(archive, moved_to):
-        scene = load_reference(replace(reference, path=str(path)))
+        scene = load_reference(replace(reference, path=str(path)), hold=False)
     require_same_scene(archive, scene.path, scene.smallest_size)
     return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
 
@@ -137,7 +140,7 @@ def refined(archive: RunArchive, cameras: Mapping[str, Camera]) -> dict[str, Cam
 def refined_views(archive: RunArchive, views: Sequence[View]) -> tuple[View, ...]:
     """Return views with `refined` cameras."""
     cameras = refined(archive, {view.name: view.camera for view in views})
-    return tuple(replace(view, camera=cameras[view.name]) for view in views)
+    return tuple(view.at(cameras[view.name]) for view in views)
 
 
 def path_cameras(

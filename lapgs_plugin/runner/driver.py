@@ -32,6 +32,7 @@ from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
@@ -136,6 +137,8 @@ class HierarchyDriver:
             RunArchive.require_room(given, self._overwrite, self._since)
         if not source.exists():
             raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
+        if self._options.images_on == "disk":  # that of the run: the one of temporary files may be in memory
+            self._context.images.keep_on_disk(next(filter(is_folder, (folder, *folder.parents))))
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
             self._context.images.read_masks(source, self._options.masks)
@@ -155,7 +158,7 @@ class HierarchyDriver:
             path = dry_run.color_path() if self._has_residuals else ColorPath.NATIVE
             if self._options.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
-            elif not self._has_residuals and (self._context.hooks or self._context.images.masks):
+            elif not self._has_residuals and (self._context.hooks or self._context.images.masked):
                 dry_run.find_image()
             manifest = make_manifest(self._adapter, self._options, call, plan, bool(scene.test))
             with self._open_archive(folder, manifest) as archive:

@@ -63,7 +63,7 @@ class StageViews:
             stage.level,
             self._pyramid,
             with_coarse=stage.signed and supervision.needs_coarse,
-            masked=bool(full.masks),
+            masked=full.masked,
         )
         self.rendering = StageRendering(
             signed=stage.signed,
@@ -71,7 +71,7 @@ class StageViews:
             views=self.cameras,
             images=self.images,
             accumulated=predictions,
-            masked=frozenset(train if full.masks else ()),
+            masked=frozenset(train if full.masked else ()),
             composed=frozenset(self.cameras if supervision.composes else test),
             on_image=context.hooks.on_image if context.hooks else None,
         )
@@ -80,7 +80,7 @@ class StageViews:
         """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""
         full, training = self._context.images, set(self.train)
         for key in self.cameras:
-            self.images.put(key, full[key].load(self._device), full.masks.get(key), with_coarse=key in training)
+            self.images.put(key, full[key].load(self._device), full.mask(key), with_coarse=key in training)
 
     def size(self, key: str, level: int) -> tuple[int, int]:
         """Return (width, height) of a view's image at a level."""
@@ -116,9 +116,13 @@ class StageViews:
     def held_out_quality(self, gaussians: Any) -> dict[str, float]:
         """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
         full, device = self._context.images, self._device
-        masks = {key: mask.to(device) for key, mask in full.masks.items()}
         return mean_quality(
-            (self._full_size(gaussians, key), full[key].load(device), masks.get(key)) for key in self.test
+            (
+                self._full_size(gaussians, key),
+                full[key].load(device),
+                None if (mask := full.mask(key)) is None else mask.to(device),
+            )
+            for key in self.test
         )
 
     def render_alone(self, rendering: StageRendering, gaussians: Any, key: str, *, black: bool = True) -> Tensor:

@@ -326,7 +326,7 @@ class ImageStore:
         with one_line_errors(path, training=True):
             self._folder.mkdir(parents=True, exist_ok=True)
             try:
-                path.write_bytes(_buffer(encoded.contiguous()))
+                path.write_bytes(tensor_bytes(encoded.contiguous()))
             except OSError:
                 path.unlink(missing_ok=True)  # half an image is useless and keeps a full disk full
                 raise
@@ -415,14 +415,14 @@ def _forget_refusal(device: torch.device) -> None:
         torch.ones((), device=device)
 
 
-def _buffer(tensor: Tensor) -> memoryview:
+def tensor_bytes(tensor: Tensor) -> memoryview:
     """Return the bytes of a contiguous CPU tensor, to read or write."""
     return tensor.view(-1).view(torch.uint8).numpy().data
 
 
 def _read_file(path: Path, stored: Tensor) -> None:
     with one_line_errors(path, "read"), path.open("rb") as stream:
-        if stream.readinto(_buffer(stored)) != stored.nbytes:
+        if stream.readinto(tensor_bytes(stored)) != stored.nbytes:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 

@@ -94,7 +94,7 @@ class LevelImages:
         pyramid: makes the images, on the stores' device.
         with_coarse: also store I^(l+1).
         masked: whether views have masks.
-        exact: keep the images as float32 tensors, for training on a CPU.
+        exact: keep the images as float32, for training on a CPU: in memory the tensors as they are.
 
     Attributes:
         targets: I^l.
@@ -113,16 +113,18 @@ class LevelImages:
         exact: bool = False,
     ) -> None:
         self._level, self._pyramid, self._device = level, pyramid, stores.device
-        self.targets: ImageStore | HeldImages = (
-            HeldImages() if exact else stores.make(level, stores.target_precision(level), f"targets_{level}")
-        )
+
+        def store(precision: str, name: str) -> ImageStore | HeldImages:
+            if exact and stores.where != "disk":
+                return HeldImages()
+            return stores.make(level, "float32" if exact else precision, f"{name}_{level}")
+
+        self.targets = store(stores.target_precision(level), "targets")
         self.coarse: UpsampledImages | None = None
         if with_coarse:
             precision = "float32" if exact else "float16"
             self.coarse = stores.make_upsampled(level + 1, precision, f"coarse_{level}", pyramid)
-        self.weights: ImageStore | HeldImages | None = None
-        if masked:
-            self.weights = HeldImages() if exact else stores.make(level, "uint8", f"weights_{level}")
+        self.weights = store("uint8", "weights") if masked else None
 
     def put(self, name: str, image: Tensor, mask: Tensor | None = None, *, with_coarse: bool = True) -> None:
         """Make and store the images of a view.

@@ -79,11 +79,12 @@ def measure_exposure(scene: Scene) -> MeasuredExposure:
 def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return the colours (n, 3) of a photo at sparse points, 0 where it does not see them, and (n,) which are right."""
     step = max(1, round(max(view.camera.size) / SIDE))
-    small = torch.nn.functional.avg_pool2d(view.image[None], step) if step > 1 else view.image[None]
+    image, mask = view.image[None], view.mask
+    small = torch.nn.functional.avg_pool2d(image, step) if step > 1 else image
     x, y, seen = _visible(view.camera, points)
-    if view.mask is not None:
+    if mask is not None:
         row, column = (y * view.camera.height).long(), (x * view.camera.width).long()
-        inside = view.mask[0, row.clamp(0, view.camera.height - 1), column.clamp(0, view.camera.width - 1)]
+        inside = mask[0, row.clamp(0, view.camera.height - 1), column.clamp(0, view.camera.width - 1)]
         seen = seen & inside
     grid = torch.stack([2 * x - 1, 2 * y - 1], -1).nan_to_num()
     colors = torch.nn.functional.grid_sample(small, grid[None, None], padding_mode="border", align_corners=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath
+from statistics import fmean
 
 import torch
 from PIL import Image
@@ -167,6 +168,6 @@ def _inside(values: Tensor, path: Path) -> Tensor:
     return values > 0.5 * min(highest, 1.0)
 
 
-def share_inside(masks: Sequence[Tensor | None]) -> float:
+def share_inside(masks: Iterable[Tensor | None]) -> float:
     """Return the share of pixels inside of masks, the mean over views; None is a view without a mask."""
-    return float(torch.stack([torch.ones(()) if mask is None else mask.float().mean() for mask in masks]).mean())
+    return fmean(1.0 if mask is None else float(mask.float().mean()) for mask in masks)

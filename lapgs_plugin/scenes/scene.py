@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from shlex import quote
+from typing import Generic, TypeVar, cast
 
 import numpy as np
 import torch
@@ -44,10 +45,37 @@ images. Models in coordinates of a map are further away."""
 
 logger = logging.getLogger(__name__)
 
+_Held = TypeVar("_Held")
+
+
+class _Pixels(Generic[_Held]):
+    """Hold a field of a `View`: a tensor, or a function that reads it at each access; None by default if `optional`."""
+
+    def __init__(self, optional: bool = False) -> None:
+        self._optional = optional
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_{name}"
+
+    def __get__(self, view: View | None, owner: type) -> _Held:
+        if view is not None:
+            held = vars(view)[self._name]
+            pixels: _Held = held() if callable(held) else held
+            return pixels
+        if self._optional:
+            return cast("_Held", None)  # the field's default, which dataclasses ask for
+        raise AttributeError
+
+    def __set__(self, view: View, held: _Held | Callable[[], _Held]) -> None:
+        vars(view)[self._name] = held
+
 
 @dataclass(frozen=True)
 class View:
     """An image and its camera.
+
+    `image` and `mask` may be given as functions without arguments, which are called at each access: such a view takes
+    no memory. `dataclasses.replace` would keep what they return; `at` does not.
 
     Attributes:
         name: unique name of the image, such as "0001.jpg" or "train/r_0.png", relative to the image folder of a COLMAP
@@ -59,8 +87,17 @@ class View:
 
     name: str
     camera: Camera
-    image: Tensor  # (3, h, w)
-    mask: Tensor | None = None  # (1, h, w)
+    image: _Pixels[Tensor] = _Pixels[Tensor]()  # noqa: RUF009  # (3, h, w)
+    mask: _Pixels[Tensor | None] = _Pixels[Tensor | None](optional=True)  # noqa: RUF009  # (1, h, w)
+
+    @property
+    def masked(self) -> bool:
+        """Whether there is a mask, which is not read."""
+        return vars(self)["_mask"] is not None
+
+    def at(self, camera: Camera) -> View:
+        """Return the view with another camera of the same size."""
+        return View(self.name, camera, vars(self)["_image"], vars(self)["_mask"])
 
 
 @dataclass(frozen=True)
@@ -104,6 +141,7 @@ def load_scene(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: bool | ProgressCallback = True,
     check: Callable[[tuple[int, int], int], None] | None = None,
+    hold: bool = True,
 ) -> Scene:
     """Load a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
 
@@ -122,6 +160,7 @@ def load_scene(
             their total.
         check: is called before any image is read, with `Scene.smallest_size` and the number of training views; what it
             raises ends the loading.
+        hold: keep the images in memory. False reads each once, to find damaged ones, and again at each use.
 
     Raises:
         SceneError: the folder, its model, an image or a mask cannot be used.
@@ -151,18 +190,25 @@ def load_scene(
     def load(posed: tuple[Frame, Camera]) -> View:
         frame, camera = posed
         size = camera.size
-        if rule.backbone is not None:
-            image = read_as_3dgs(frame.path, size, behind)
-        else:
-            image = read_image(frame.path, size=size, background=background)
-        mask = alpha_mask(frame.path, size) if masks == ALPHA else None
-        if mask_files:
-            mask = read_mask(mask_files[frame.name], image_size(frame.path), size)
-        return View(frame.name, camera, image, mask)
+
+        def image() -> Tensor:
+            if rule.backbone is not None:
+                return read_as_3dgs(frame.path, size, behind)
+            return read_image(frame.path, size=size, background=background)
+
+        def mask() -> Tensor | None:
+            if mask_files:
+                return read_mask(mask_files[frame.name], image_size(frame.path), size)
+            return alpha_mask(frame.path, size) if masks == ALPHA else None
+
+        pixels, inside = image(), mask()
+        if hold:
+            return View(frame.name, camera, pixels, inside)
+        return View(frame.name, camera, image, None if inside is None else mask)
 
     items = list(zip(frames, cameras, strict=True))
     views = in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=progress)
-    if masks == ALPHA and all(view.mask is None for view in views):
+    if masks == ALPHA and not any(view.masked for view in views):
         raise UserInputError(
             f"--masks alpha: no image of {path} has transparent pixels; leave the option out, which uses "
             f"{path / MASKS} if it is there"

@@ -76,8 +76,8 @@ class StageEvaluation:
         whole = to_full_size(image, view.camera.size, level, self.context.pyramid)
         if exposure is not None:
             whole = transform_colors(whole, exposure.to(device))
-        mask = None if view.mask is None else view.mask.to(device)
-        photo = view.image.to(device)
+        photo, mask = view.image.to(device), view.mask
+        mask = None if mask is None else mask.to(device)
         return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
 
     def warn_of_a_fall(self, run: StageRun, measured: Mapping[str, float]) -> None:

@@ -99,13 +99,13 @@ class StageImages:
         return ImageStores(sizes, self._context.device, eight_bit, where, self._folder)
 
     def _level_images(self, stage: Stage) -> LevelImages:
-        """Return the targets of a stage's training views, on a CPU as float32 tensors."""
+        """Return the targets of a stage's training views, on a CPU as float32."""
         context, views = self._context, self._context.scene.train
         on_gpu = context.device.type == "cuda"
         eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
         with_coarse = context.supervision.needs_coarse and stage.level < context.plan.levels - 1
-        stores = self._stores(views, eight_bit=eight_bit)
-        masked = any(view.mask is not None for view in views)
+        stores = self._stores(views, context.settings.images_on, eight_bit)
+        masked = any(view.masked for view in views)
         images = LevelImages(
             stores, stage.level, context.pyramid, with_coarse=with_coarse, masked=masked, exact=not on_gpu
         )
