@@ -1,4 +1,8 @@
-"""Write files atomically, lock folders, and turn errors of the file system into one line."""
+"""Write files atomically, lock folders, and turn errors of the file system into one line.
+
+Nothing is written through a link inside a folder that this package writes: `require_own`, `require_own_entries`. The
+rule for reading is `untrusted.require_regular`.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,10 @@ import errno
 import os
 import shlex
 import socket
+import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -57,7 +62,8 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as stream:
+        temporary.unlink(missing_ok=True)
+        with temporary.open("xb") as stream:  # never through a link
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -85,6 +91,7 @@ def whole_file(path: Path, what: str) -> Iterator[Path]:
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix.lower()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.unlink(missing_ok=True)  # a link would be followed
         yield unfinished
         unfinished.replace(path)
     except OSError as error:
@@ -152,6 +159,39 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  # Path.is_dir raises for these names
 
 
+def require_own(path: Path) -> None:
+    """Check that a path which is to be written is free, or a file or folder and no link.
+
+    Raises:
+        RunFolderError: it is a link, a pipe, a socket or a device, or its folder cannot be read.
+    """
+    with one_line_errors(path, "read"):
+        try:
+            mode = path.lstat().st_mode
+        except FileNotFoundError:
+            return
+    if stat.S_ISLNK(mode):
+        raise RunFolderError(
+            f"{path} is a link, through which nothing is written; remove it, or put what it points to in its place"
+        )
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise RunFolderError(f"{path} is a pipe, socket or device, expected a file or a folder; remove it")
+
+
+def require_own_entries(folder: Path, names: Iterable[str]) -> None:
+    """Check some entries of a folder, and all that these hold, with `require_own`. The folder may be a link itself.
+
+    Deeper down, links to what lies in the folder are accepted: loggers of checkouts make such.
+    """
+    whole = os.path.realpath(folder)
+    for name in names:
+        require_own(folder / name)
+        for parent, folders, files in os.walk(folder / name):
+            for entry in (Path(parent, inner) for inner in (*folders, *files)):
+                if not (entry.is_symlink() and os.path.realpath(entry).startswith(whole + os.sep)):
+                    require_own(entry)
+
+
 def refuse_lfs_pointer(file: Path, kind: type[LapgsError]) -> None:
     """Raise an error of this kind if a file is the short text that Git leaves in its place where Git LFS is missing."""
     with file.open("rb") as stream:
@@ -206,6 +246,7 @@ class FolderLock:
             RunFolderError: another process has it.
         """
         path = folder / LOCK
+        require_own(path)
         with one_line_errors(path, training=True):
             stream = path.open("a+b")
             try:

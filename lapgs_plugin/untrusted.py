@@ -2,6 +2,7 @@
 
 All of this package reads such files here. Size, nesting and numbers are limited first; then values are validated
 against a type. Every error is one line that names the file, the key, the value, what was expected and what to do.
+Readers of other formats call `require_regular` before they open a file.
 
 A type is anything that pydantic validates. Dataclasses with `STRICT` as their `__pydantic_config__`, and dictionaries
 that derive from `Strict`, accept no other types, no unknown keys and no NaN.
@@ -10,10 +11,12 @@ that derive from `Strict`, accept no other types, no unknown keys and no NaN.
 from __future__ import annotations
 
 import codecs
+import errno
 import math
 import os
 import re
 import reprlib
+import stat
 import sys
 from functools import lru_cache
 from pathlib import Path
@@ -64,6 +67,24 @@ class StrictWithMore(TypedDict):
     """Type those values of a dictionary that are used; it may have others."""
 
     __pydantic_config__ = _STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
+
+
+def require_regular(path: Path) -> None:
+    """Check that a path is a regular file, or a link to one, that fits into this machine's memory.
+
+    Reading a pipe may wait for ever, and reading a device may never end.
+
+    Raises:
+        OSError: it is not, or is missing.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "a pipe, socket or device, no file", str(path))
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
+    if status.st_size > memory:
+        raise OSError(errno.EFBIG, f"it has {status.st_size:,} bytes, more than this machine's memory", str(path))
 
 
 def read_json(
@@ -249,6 +270,7 @@ def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError]
     """Read a file of at most `limit` bytes."""
     data = bytearray()
     try:
+        require_regular(path)
         with path.open("rb") as stream:
             # In parts: a single read would allocate all that it asks for.
             while len(data) <= limit and (part := stream.read(MIB)):

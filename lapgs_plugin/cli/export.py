@@ -88,7 +88,7 @@ def export(
     from lapgs_plugin.runs.layout import EXPORT
 
     archive = RunArchive.open(run)
-    folder = archive.path(EXPORT) if settings.out is None else settings.out
+    folder = archive.results(EXPORT) if settings.out is None else settings.out
     require_place(folder)
     if settings.html or settings.merge:
         _write_one(archive, settings, folder)

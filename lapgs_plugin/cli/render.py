@@ -147,7 +147,7 @@ def _write_clip(
 
     path = settings.trajectory
     assert path is not None
-    out = archive.path(RENDERS, f"{Path(path).stem}.mp4") if settings.out is None else settings.out
+    out = archive.results(RENDERS) / f"{Path(path).stem}.mp4" if settings.out is None else settings.out
     cameras = path_cameras(archive, path, settings.frames, DEFAULT_FRAMES, scene)
     if out.suffix.lower() in OTHER_VIDEOS:
         raise UserInputError(f"--out {out}: expected an {VIDEO} file or a folder for images")
@@ -215,7 +215,7 @@ def _write_views(
     from lapgs_plugin.rendering.run import run_scene
     from lapgs_plugin.runs.layout import RENDERS
 
-    folder = archive.path(RENDERS) if settings.out is None else settings.out
+    folder = archive.results(RENDERS) if settings.out is None else settings.out
     require_place(folder)
     for split, chosen in _choose(run_scene(archive, scene), settings.views).items():
         _write_split(renderer, chosen, level, folder / split, settings)

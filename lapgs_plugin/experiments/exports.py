@@ -10,7 +10,7 @@ from typing import Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError, require_extra
 from lapgs_plugin.files import atomic_write, one_line_errors, write_text
-from lapgs_plugin.untrusted import parse_json, shortened
+from lapgs_plugin.untrusted import parse_json, require_regular, shortened
 
 CSV, PARQUET, MARKDOWN, LATEX = "results.csv", "results.parquet", "tables.md", "tables.tex"
 NAMES = ("variant", "baseline", "run", "scene", "backbone")
@@ -67,6 +67,7 @@ def read_csv(path: Path) -> list[dict[str, Any]]:
         OSError: the file cannot be read.
         ValueError: the file is not such a table.
     """
+    require_regular(path)
     with path.open(newline="", encoding="utf-8") as stream:
         reader = csv.DictReader(stream)
         try:

@@ -27,7 +27,7 @@ from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.expansion import RunSpec
-from lapgs_plugin.files import one_line_errors
+from lapgs_plugin.files import one_line_errors, require_own
 from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 
 FORMAT_VERSION = 1
@@ -162,6 +162,7 @@ class ResultStore:
     @classmethod
     def create(cls, path: Path) -> ResultStore:
         """Open the store at `path`; make it if it does not exist."""
+        require_own(path)
         with one_line_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             missing = not path.exists() or path.stat().st_size == 0

@@ -10,7 +10,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty
 
 from lapgs_plugin.errors import joined
-from lapgs_plugin.untrusted import shortened
+from lapgs_plugin.untrusted import require_regular, shortened
 
 HEADER_BYTES = 2**18
 """Longest header that is read; the header of a Gaussian field is far shorter unless it has many comments."""
@@ -51,6 +51,7 @@ def _check_header(path: Path) -> None:
         ValueError: it is smaller, or has no valid header.
         OSError: the file cannot be read.
     """
+    require_regular(path)
     with path.open("rb") as stream:
         start = stream.read(HEADER_BYTES)
         size = stream.seek(0, 2)

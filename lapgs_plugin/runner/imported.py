@@ -30,7 +30,7 @@ from lapgs_plugin.adapters.info import RASTER_OPTIONS, BackboneInfo
 from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
 from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.files import BARE_RECORD, one_line_errors
+from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import MIXED_GRID
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
@@ -287,8 +287,7 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
             f"{place / 'point_cloud'} holds fields of iterations {found}, expected {iteration}; choose with --iteration"
         )
     info = place / TRAIN_INFO
-    with one_line_errors(info, "read"):
-        text = info.read_text(encoding="utf-8", errors="replace") if info.is_file() else ""
+    text = read_text(info, error=RunFolderError, advice=COPY) if exists(info) else ""
     seconds = re.search(r"Training Time: ([0-9]{1,12}(?:\.[0-9]{1,6})?) seconds", text)
     peak = re.search(r"Peak GS number: ([0-9]{1,12})\b", text)
     return ForeignLevel(

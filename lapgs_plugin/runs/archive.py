@@ -27,6 +27,7 @@ from lapgs_plugin.runs.layout import (
     exists,
     remove_results,
     remove_scratch,
+    require_own_results,
     require_room,
 )
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, read_manifest
@@ -48,7 +49,8 @@ class RunArchive(RunFiles):
 
     Use `create` for a new run and `open` for an existing one. `close`, or leaving the archive as a context manager,
     releases a folder opened for writing. Methods that write raise RunFolderError when the disk is full or the folder is
-    not writable, and leave the previous file as it was.
+    not writable, and leave the previous file as it was. A folder with links among its entries is not opened for
+    writing; reading follows links to files.
     """
 
     require_room = staticmethod(require_room)
@@ -75,6 +77,7 @@ class RunArchive(RunFiles):
         require_room(folder, overwrite, since)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
+        require_own_results(folder)
         archive = cls(folder, manifest, FolderLock.acquire(folder))
         try:
             require_room(folder, overwrite, since)  # another process may have started one before the lock was ours
@@ -104,6 +107,8 @@ class RunArchive(RunFiles):
         """
         folder = Path(path)
         manifest = read_manifest(folder)
+        if resume:
+            require_own_results(folder)
         lock = FolderLock.acquire(folder) if resume else None
         try:
             if resume:

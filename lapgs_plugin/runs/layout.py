@@ -25,13 +25,21 @@ where i is the new number of iterations, and count from the moment that the mani
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.files import LOCK, MANIFEST, PREVIEW, TEMPORARY_PATTERN, one_line_errors
-from lapgs_plugin.untrusted import read_json
+from lapgs_plugin.files import (
+    LOCK,
+    MANIFEST,
+    PREVIEW,
+    TEMPORARY_PATTERN,
+    one_line_errors,
+    require_own_entries,
+)
+from lapgs_plugin.untrusted import TEXT_BYTES, read_json
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
@@ -85,13 +93,25 @@ def _oldest(path: Path) -> int:
 
 
 def exists(path: Path) -> bool:
-    """Return whether there is a file.
+    """Return whether there is a file, or a link, whatever that points to.
 
     Raises:
         RunFolderError: its folder cannot be read.
     """
     with one_line_errors(path, "read"):
-        return path.exists()
+        try:
+            path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+    return True
+
+
+def require_own_results(folder: Path) -> None:
+    """Check that all that is written in a run folder is its own, see `files.require_own_entries`."""
+    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG)
+    with one_line_errors(folder, "read"):
+        levels = [path.name for path in folder.glob("level_*")]
+    require_own_entries(folder, (*files, RENDERS, EXPORT, TENSORBOARD, CACHE, *levels))
 
 
 def is_run(folder: Path) -> bool:
@@ -136,4 +156,7 @@ def remove_scratch(folder: Path) -> None:
         shutil.rmtree(folder / CACHE)
     if (folder / HISTORY).exists():
         with (folder / HISTORY).open("r+b") as stream:
-            stream.truncate(stream.read().rfind(b"\n") + 1)
+            start = max(0, stream.seek(0, os.SEEK_END) - TEXT_BYTES)
+            stream.seek(start)
+            if (end := stream.read().rfind(b"\n") + 1) or not start:  # no line is as long as this: reading says so
+                stream.truncate(start + end)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.files import FolderLock, one_line_errors, write_text
+from lapgs_plugin.files import FolderLock, one_line_errors, require_own_entries, write_text
 from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import HistoryEntry, Metrics
@@ -64,6 +64,15 @@ class RunFiles:
     def path(self, *parts: str) -> Path:
         """Return the path of the run folder as it was given, or of something in it; whole ones after `os.chdir`."""
         return self._folder.joinpath(*parts)
+
+    def results(self, name: str) -> Path:
+        """Return the path of an entry that a command writes without the lock, such as `layout.RENDERS`.
+
+        Raises:
+            RunFolderError: it is a link, or holds one.
+        """
+        require_own_entries(self._folder, [name])
+        return self.path(name)
 
     def append_history(self, entry: dict[str, Any]) -> None:
         """Append one entry to the history: JSON with finite numbers.

@@ -11,6 +11,7 @@ import torch
 
 from lapgs_plugin.errors import RunFolderError, UserInputError, first_line
 from lapgs_plugin.files import atomic_write, one_line_errors
+from lapgs_plugin.untrusted import require_regular
 
 PLAIN = (int, float, complex, bool, str, bytes, type(None), torch.dtype, torch.device)
 """Types besides tensors and containers that a checkpoint may hold."""
@@ -44,6 +45,7 @@ def read_tensors(path: Path, advice: str) -> dict[str, Any]:
         RunFolderError: it cannot be read, or its tensors would take more memory than the file has bytes.
     """
     try:
+        require_regular(path)
         _require_stored(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # RuntimeError, UnpicklingError, EOFError, OSError, ...: it depends on the damage

@@ -28,6 +28,7 @@ from lapgs_plugin.errors import SceneError, UserInputError, joined
 from lapgs_plugin.files import is_file, is_folder, refuse_lfs_pointer, whole_file
 from lapgs_plugin.limits import LONGEST_NAME
 from lapgs_plugin.scenes.image_files import check_before_decoding, check_size, damaged, reaches_its_end
+from lapgs_plugin.untrusted import require_regular
 
 JPEG: dict[str, Any] = {"format": "JPEG", "quality": 95, "subsampling": "4:4:4"}
 """How Pillow writes JPEG files."""
@@ -89,6 +90,12 @@ def where_else(scene: Path, name: str) -> str:
     inside = [*sorted(folder.name for folder in scene.iterdir() if is_folder(folder)), "."]
     others = [folder for folder in inside if is_file(find_image(scene / folder / name))]
     return f"choose {' or '.join(others)} with --images" if others else "put the photos there"
+
+
+def not_there(path: Path) -> str:
+    """Return the beginning of the message about an image that is not there, which says where a link leads."""
+    link = f": it is a link to {path.readlink()}, which is not there" if path.is_symlink() else ""
+    return f"{path}: no such image{link}"
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -351,8 +358,12 @@ def _open(path: Path, pixels: bool = False) -> oiio.ImageInput:
             f"{path.parent}: the name of image {path.name[:32]}... has {length} bytes, expected at most "
             f"{LONGEST_NAME}; rename the photo and reconstruct or export again"
         )
-    if not is_file(path):
-        raise SceneError(f"{path}: no such image; put it there")
+    try:
+        require_regular(path)
+    except FileNotFoundError:
+        raise SceneError(f"{not_there(path)}; put it there") from None
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error.strerror}; expected an image file, replace it") from error
     if str(path).encode(errors="replace").decode() != str(path):
         raise SceneError(f"{path}: its name is not UTF-8; rename it and reconstruct or export again")
     require_readable(path)

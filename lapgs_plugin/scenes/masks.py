@@ -14,6 +14,7 @@ from lapgs_plugin.errors import SceneError, UserInputError, printable
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.scenes.blender import mask_folder
 from lapgs_plugin.scenes.images import SUFFIXES, has_alpha, image_size, is_photo, read_image, same_shape
+from lapgs_plugin.untrusted import require_regular
 
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
@@ -81,9 +82,13 @@ def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None
     """Check that no photo counts as its own mask, as happens if --masks names the folder of the photos.
 
     Raises:
-        SceneError: one is.
+        SceneError: one is, or a mask is no file.
     """
     for name, mask in masks.items():
+        try:
+            require_regular(mask)
+        except OSError as error:
+            raise SceneError(f"{mask} cannot be read: {error.strerror}; expected a mask, put it there") from error
         if mask.samefile(photos[name]):
             raise SceneError(
                 f"--masks {mask.parent}: {printable(mask.name)} is the photo itself, expected its mask; give the "

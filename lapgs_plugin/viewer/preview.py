@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from PIL import Image
 
 from lapgs_plugin.files import MANIFEST, PREVIEW, atomic_write
-from lapgs_plugin.untrusted import read_json
+from lapgs_plugin.untrusted import read_json, require_regular
 
 if TYPE_CHECKING:
     from lapgs_plugin.runs.archive import RunArchive
@@ -35,6 +35,7 @@ def read_preview(run: Path) -> Image.Image | None:
     """Read the preview in a run folder; None when it is missing, damaged, or older than the last training."""
     try:
         manifest = read_json(run / MANIFEST, dict[str, Any])
+        require_regular(run / PREVIEW)
         image = Image.open(io.BytesIO((run / PREVIEW).read_bytes()), formats=("JPEG",))
         if image.info.get("comment") != _state(manifest["created"], len(manifest["records"])):
             return None
