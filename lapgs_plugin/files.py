@@ -179,17 +179,12 @@ def require_own(path: Path) -> None:
 
 
 def require_own_entries(folder: Path, names: Iterable[str]) -> None:
-    """Check some entries of a folder, and all that these hold, with `require_own`. The folder may be a link itself.
-
-    Deeper down, links to what lies in the folder are accepted: loggers of checkouts make such.
-    """
-    whole = os.path.realpath(folder)
+    """Check some entries of a folder, and all that these hold, with `require_own`. The folder may be a link itself."""
     for name in names:
         require_own(folder / name)
         for parent, folders, files in os.walk(folder / name):
-            for entry in (Path(parent, inner) for inner in (*folders, *files)):
-                if not (entry.is_symlink() and os.path.realpath(entry).startswith(whole + os.sep)):
-                    require_own(entry)
+            for inner in (*folders, *files):
+                require_own(Path(parent, inner))
 
 
 def refuse_lfs_pointer(file: Path, kind: type[LapgsError]) -> None:
@@ -252,7 +247,7 @@ class FolderLock:
             try:
                 if lock(stream.fileno(), patience) is False:
                     stream.seek(0)
-                    holder = stream.read().decode(errors="replace").strip() or "another process"
+                    holder = stream.read(1_000).decode(errors="replace").strip() or "another process"
                     raise RunFolderError(
                         f"{folder} is being written by {holder}; wait for it, stop it, or choose another folder"
                     )

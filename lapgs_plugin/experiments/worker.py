@@ -20,6 +20,7 @@ from lapgs_plugin.environment import run_program, versions
 from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.experiments.commands import Step
 from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
+from lapgs_plugin.files import require_own
 
 RENEW_EVERY = LEASE / 8
 LAST_LINES = 12
@@ -89,10 +90,12 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
     job = claim.job
     folder = Path(job.folder)
+    log = Path(job.log)
+    require_own(folder)
+    require_own(log)
     if folder.exists():  # left by an earlier command
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    log = Path(job.log)
     log.parent.mkdir(parents=True, exist_ok=True)
     started, clock = datetime.now(timezone.utc).isoformat(timespec="seconds"), time.perf_counter()
     with log.open("wb") as stream:

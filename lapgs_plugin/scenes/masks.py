@@ -32,9 +32,11 @@ def resolve_masks(scene: Path, setting: str) -> str:
     """Return what a value of --masks means for a scene: "none", "alpha", or a folder relative to the scene or absolute.
 
     Raises:
-        UserInputError: there is no such folder.
+        UserInputError: there is no such folder, or the link in its place leads to none.
     """
     if setting == AUTO:
+        if (scene / MASKS).is_symlink() and not is_folder(scene / MASKS):
+            raise UserInputError(f"{scene / MASKS} is a link to no folder; put the masks there, or remove it")
         return MASKS if is_folder(scene / MASKS) else mask_folder(scene) or NONE
     if setting in (NONE, ALPHA) or is_folder(scene / setting):
         return setting

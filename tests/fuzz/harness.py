@@ -290,6 +290,10 @@ class Fuzzer:
         return path
 
 
+LINKS = {"loop": None, "astray": "nowhere/at all", "device": "/dev/zero"}
+"""Actions of `rearrange` that put a link in the place of a path, and where it leads; None: to itself."""
+
+
 def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
     """Remove, replace and move what lies in a folder.
 
@@ -320,8 +324,10 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
             path.mkdir()
         elif action == "file":
             path.touch()
-        elif action == "loop":
-            path.symlink_to(path.name)
+        elif action == "pipe":
+            os.mkfifo(path)
+        elif action in LINKS:
+            path.symlink_to(LINKS[action] or path.name)
 
 
 def judged(answer: dict[str, Any], case: Case, folder: Path, templates: Path) -> Problem | None:

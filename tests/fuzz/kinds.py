@@ -61,7 +61,7 @@ def damaged_layout(data: bytes, random: Random) -> bytes:
     )
     steps = []
     for _ in range(random.choice((1, 1, 2))):
-        action = random.choice(("remove", "folder", "file", "loop", "move", "copy"))
+        action = random.choice(("remove", "folder", "file", "loop", "astray", "device", "pipe", "move", "copy"))
         other = {"move": [random.choice(names)], "copy": [random.choice(paths)]}.get(action, [])
         steps.append([action, random.choice(paths), *other])
     return json.dumps(steps).encode()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lapgs_plugin.errors import LapgsError, UserInputError
-from lapgs_plugin.files import atomic_write
+from lapgs_plugin.files import atomic_write, require_own_entries
 from lapgs_plugin.scenes.masks import MASKS
 from lapgs_plugin.scenes.parallel import ProgressCallback, bar, in_threads
 from lapgs_plugin.scenes.prepare.photos import Photos
@@ -98,6 +98,7 @@ class Job:
 @contextmanager
 def opened_work(work: Path, settings: dict[str, Any], overwrite: bool) -> Iterator[None]:
     """Make the work folder, or reuse that of the same photos and settings. A new one is removed if the block fails."""
+    require_own_entries(work.parent, [work.name])
     file = work / "settings.json"
     if file.is_file():
         before = read_json(file, dict[str, Any], advice=f"delete {work} to start over")
