@@ -8,6 +8,7 @@ import os
 import random
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, wraps
@@ -81,7 +82,8 @@ class _NamelessFile:
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, threading.Lock()
         with one_line_errors(folder):
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # held as long as this object
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # open as long as this object is used
+        weakref.finalize(self, self._file.close)
 
     def keep(self, tensor: Tensor) -> Callable[[], Tensor]:
         """Append a tensor; see `Keep`."""

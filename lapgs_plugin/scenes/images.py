@@ -360,7 +360,7 @@ def _open(path: Path, pixels: bool = False) -> oiio.ImageInput:
         )
     try:
         require_regular(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, ValueError):  # ValueError: no file can have such a name
         raise SceneError(f"{not_there(path)}; put it there") from None
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}; expected an image file, replace it") from error

@@ -20,7 +20,7 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
-from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image, same_shape, where_else
+from lapgs_plugin.scenes.images import image_size, not_there, read_as_3dgs, read_image, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
     ALPHA,
     AUTO,
@@ -329,7 +329,7 @@ def check_source(path: Path, source: SceneSource) -> None:
         leave_out = f", or leave them out with `lapgs prepare {quote(str(path))} OUT`" if some else ""
         name = missing[0].name if source.kind == "colmap" else missing[0].path.name
         raise SceneError(
-            f"{missing[0].path}: no such image ({len(missing)} of {len(frames)} are missing); "
+            f"{not_there(missing[0].path)} ({len(missing)} of {len(frames)} are missing); "
             f"{where_else(path, name)}{leave_out}"
         )
     for frame in frames:

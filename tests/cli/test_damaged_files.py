@@ -1,11 +1,16 @@
-"""Run folders with damaged files: every command ends in one line that names the file, and writes nothing."""
+"""Run folders with damaged files: every command ends in one line that names the file, and writes nothing.
+
+So it is with links and special files: nothing is written through a link, waited for or read without end.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
+import signal
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +29,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import HISTORY, METRICS
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run
-from tests.folders import files_in
+from tests.folders import files_in, snapshot
 from tests.mishaps import FailingWrites, disk_full
 
 app = typer.Typer()
@@ -318,3 +323,136 @@ def test_a_folder_whose_name_cannot_be_kept_is_refused_before_training(tmp_path:
     with pytest.raises(LapgsError, match=r"holds the text .*expected UTF-8"):
         write_run(tmp_path / "run", odd)
     assert not (tmp_path / "run").exists()
+
+
+def replaced_by_a_link(path: Path, target: Path | str) -> None:
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+    path.parent.mkdir(exist_ok=True)
+    path.symlink_to(target)
+
+
+@pytest.fixture
+def precious(tmp_path: Path) -> Path:
+    """What links point to; it stays as it is."""
+    folder = tmp_path / "precious"
+    for name in ("file", "point_cloud.ply", "test/00.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("precious")
+    return folder
+
+
+WRITTEN = [".lock", MANIFEST, HISTORY, METRICS, "checkpoint.pt", "run.toml", "preview.jpg", "level_0", "level_1"]
+WRITTEN += ["level_1/point_cloud.ply", "cache", "tensorboard", "renders", "renders/test", "export", "report.html"]
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_nothing_is_trained_through_a_link(scene: Path, precious: Path, tmp_path: Path, name: str) -> None:
+    before, run = snapshot(precious), write_run(tmp_path / "run", scene, finished=1)
+    if name == MANIFEST:
+        (run / name).rename(precious / name)
+        before = snapshot(precious)
+    for target in (precious / name,) if name == MANIFEST else (precious / "file", precious, precious / "nothing"):
+        replaced_by_a_link(run / name, target)
+        inside = files_in(run)
+        for how in ("--resume", "--overwrite"):
+            refused(f"{run / name} is a link", "train", scene, "-o", run, how, "--threads", "1")
+        assert snapshot(precious) == before
+        assert files_in(run) == inside
+
+
+@pytest.mark.parametrize(("command", "name"), [("render", "renders"), ("render", "renders/test"), ("export", "export")])
+def test_no_result_is_written_through_a_link(run: Path, precious: Path, command: str, name: str) -> None:
+    before = snapshot(precious)
+    replaced_by_a_link(run / name, precious)
+    refused(f"{run / name} is a link", command, run)
+    assert snapshot(precious) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "name"), [("eval", METRICS), ("eval", f".{METRICS}.{os.getpid()}.tmp"), ("report", "report.html")]
+)
+def test_a_result_takes_the_place_of_a_link(run: Path, precious: Path, command: str, name: str) -> None:
+    write_metrics(run)
+    before = snapshot(precious)
+    replaced_by_a_link(run / name, precious / "file")
+    lapgs(command, run, "--device", "cpu", *(("--lpips", "none") if command == "eval" else ()))
+    assert snapshot(precious) == before
+    assert not (run / name).is_symlink()
+
+
+def test_a_run_folder_may_be_a_link(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "big disk").mkdir()
+    (tmp_path / "runs").symlink_to("big disk")
+    run = write_run(tmp_path / "runs", scene)
+    lapgs("export", run)
+    RunArchive.open(run, resume=True).close()
+    assert any((tmp_path / "big disk" / "export").iterdir())
+
+
+def test_fields_may_be_links_to_files_when_they_are_read(run: Path, tmp_path: Path) -> None:
+    """As caches of downloads keep them."""
+    kept = (run / "level_0" / "point_cloud.ply").rename(tmp_path / "blob")
+    replaced_by_a_link(run / "level_0" / "point_cloud.ply", kept)
+    lapgs("export", run)
+    assert len(list((run / "export").iterdir())) == 2
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def loop(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def without_end(path: Path) -> None:
+    """A file of more bytes than memory has, none of them on the disk."""
+    path.touch()
+    os.truncate(path, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") + 1)
+
+
+@pytest.fixture
+def no_waiting() -> Iterator[None]:
+    """Let a test fail that waits for a pipe."""
+
+    def late(*_: object) -> None:
+        raise AssertionError("it waits")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("no_waiting")
+@pytest.mark.parametrize("put", [pipe, device, loop, without_end])
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("export", MANIFEST),
+        ("export", "level_0/point_cloud.ply"),
+        ("report", HISTORY),
+        ("report", METRICS),
+        ("train", "checkpoint.pt"),
+        ("train", HISTORY),
+        ("import-run", "cfg_args"),
+        ("import-run", "runtime_breakdown.json"),
+        ("import-run", "lapgs_record.json"),
+    ],
+)
+def test_only_files_are_read(tmp_path: Path, scene: Path, command: str, name: str, put: Callable[[Path], None]) -> None:
+    if command == "import-run":
+        folder = foreign_folder(tmp_path / "foreign", scene)
+        (folder / "point_cloud" / "iteration_30" / "point_cloud.ply").write_bytes(b"")
+        arguments: tuple[object, ...] = (folder, "--backbone", "fastgs")
+    else:
+        folder = write_run(tmp_path / "run", scene, finished=1 if command == "train" else 2)
+        arguments = (scene, "-o", folder, "--resume", "--threads", "1") if command == "train" else (folder,)
+    (folder / name).unlink(missing_ok=True)
+    put(folder / name)
+    refused(f"{folder / name} (cannot be read|is a link|is a pipe)|has no {MANIFEST}", command, *arguments)

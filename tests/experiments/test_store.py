@@ -251,3 +251,11 @@ def test_a_transaction_that_is_killed_leaves_the_store_as_it_was(
     assert {outcome.state for outcome in store.outcomes(run_ids)} == {PENDING}
     assert store.claim(run_ids) is not None
     assert Counter(outcome.state for outcome in store.outcomes(run_ids)) == {PENDING: 7, RUNNING: 1}
+
+
+def test_a_store_is_not_made_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "empty").touch()
+    (tmp_path / "results.sqlite").symlink_to(tmp_path / "empty")
+    with pytest.raises(RunFolderError, match="is a link"):
+        ResultStore.create(tmp_path / "results.sqlite")
+    assert (tmp_path / "empty").read_bytes() == b""

@@ -450,6 +450,17 @@ def test_cameras_without_distortion_are_refused_and_made_smaller(tmp_path: Path)
     assert max(view.camera.width for view in load_scene(tmp_path / "out", progress=False).train) == 100
 
 
+def test_unfinished_work_is_not_continued_through_a_link(tmp_path: Path) -> None:
+    scene = _scene(tmp_path / "scene")
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "file").write_text("precious")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".prepare").symlink_to(tmp_path / "precious")
+    with pytest.raises(LapgsError, match=r"out/\.prepare is a link"):
+        prepare_scene(scene, tmp_path / "out", overwrite=True, progress=False)
+    assert snapshot(tmp_path / "precious") == {"file": b"precious"}
+
+
 def test_an_interrupted_call_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = _scene(tmp_path / "scene")
 

@@ -207,6 +207,23 @@ def test_a_choice_of_masks_that_masks_nothing_is_one_line(scene: Path) -> None:
         load_scene(scene, masks="images", progress=False)
 
 
+@pytest.mark.parametrize(
+    ("aim", "message"),
+    [("itself", "Too many levels of symbolic links"), ("nowhere", "No such file"), ("/dev/zero", "socket or device")],
+)
+def test_masks_that_are_no_files_are_one_line(aim: str, message: str, scene: Path) -> None:
+    _write_masks(scene, "{stem}.png")
+    mask = min((scene / "masks").iterdir())
+    mask.unlink()
+    mask.symlink_to(mask.name if aim == "itself" else aim)
+    with pytest.raises(SceneError, match=f"{mask} cannot be read: .*{message}.*; expected a mask"):
+        load_scene(scene, progress=False)
+    shutil.rmtree(scene / "masks")
+    (scene / "masks").symlink_to(aim)
+    with pytest.raises(UserInputError, match="masks is a link to no folder"):
+        load_scene(scene, progress=False)
+
+
 def test_masks_that_do_not_fit_are_one_line(scene: Path, tmp_path: Path) -> None:
     def refused(message: str, kind: type[Exception] = SceneError, masks: str = "masks") -> None:
         with pytest.raises(kind, match=message):

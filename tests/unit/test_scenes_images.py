@@ -461,10 +461,21 @@ def test_sizes_that_no_photo_has_take_no_memory(tmp_path: Path, kind: str) -> No
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak < 300_000  # KiB; seen 6,200
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.png", tmp_path):
-        with pytest.raises(SceneError, match="no such image"):
-            read_image(path)
+def test_a_photo_that_is_no_file(tmp_path: Path) -> None:
+    for name, aim, message in (
+        ("loop.png", "loop.png", "cannot be read: Too many levels of symbolic links"),
+        ("device.png", "/dev/zero", "cannot be read: a pipe, socket or device"),
+        ("folder.png", ".", "cannot be read: Is a directory"),
+        ("astray.png", "nowhere", "no such image: it is a link to nowhere, which is not there"),
+    ):
+        (tmp_path / name).symlink_to(aim)
+        with pytest.raises(SceneError, match=f"{name}:? {message}"):
+            read_image(tmp_path / name)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="no such image"):
+        read_image(tmp_path / "none.png")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

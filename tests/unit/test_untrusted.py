@@ -108,6 +108,7 @@ def test_files_that_are_not_there_or_no_files(tmp_path: Path) -> None:
     ):
         refused(read, tmp_path / "nothing", "cannot be read: No such file", advice)
         refused(read, tmp_path, "cannot be read: Is a directory", advice)
+        refused(read, Path("/dev/zero"), "cannot be read: a pipe, socket or device", advice)
 
 
 def test_a_json_file_that_is_too_large_says_how_to_read_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

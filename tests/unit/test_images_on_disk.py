@@ -1,0 +1,117 @@
+"""With --images-on disk, memory does not grow with the number of photos, under either trainer, and no bit changes."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lapgs_plugin.checkouts.level_views import FullSizeImage, SceneImages
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from tests.cli.run_folder import write_scene
+from tests.training_runs import plys, train
+from tests.training_scene import ring_camera
+
+SIZE = (97, 65)
+SETTINGS = TrainSettings(
+    iterations=2, levels=2, hierarchy="laplacian", sh_degree=0, densification=Densification(until=0)
+)
+
+
+class Alive(StageHook):
+    """Note the most bytes of images at the start of any stage."""
+
+    most = 0
+
+    def before_render(self, context: StageContext) -> None:
+        if context.iteration > 1:
+            return
+        tensors = (each for each in gc.get_objects() if type(each) is torch.Tensor)
+        images = {each.data_ptr(): each.nbytes for each in tensors if each.shape[-2:] in ((65, 97), (33, 49))}
+        self.most = max(self.most, sum(images.values()))
+
+
+def masked_scene(folder: Path, photos: int) -> Path:
+    scene = write_scene(folder, [f"photos/{i:02d}.png" for i in range(photos)], SIZE)
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, :20] = 0
+    (scene / "masks" / "photos").mkdir(parents=True)
+    for i in range(photos):
+        Image.fromarray(mask).save(scene / "masks" / "photos" / f"{i:02d}.png")
+    return scene
+
+
+def trained(folder: Path, scene: Path, where: str) -> tuple[int, list[bytes]]:
+    """Most bytes of images, and the fields."""
+    alive, loaded = Alive(), load_scene(scene, eval=True, progress=False, hold=where != "disk")
+    loaded = replace(loaded, points=loaded.points[:200], colors=loaded.colors[:200])
+    archive = train(folder, loaded, replace(SETTINGS, images_on=where), user_hooks=[alive])
+    return alive.most, plys(archive)
+
+
+def test_training_holds_no_more_images_of_more_photos(tmp_path: Path) -> None:
+    few, many = (masked_scene(tmp_path / str(count), count) for count in (8, 32))
+    on_disk = {count: trained(tmp_path / f"{count} disk", scene, "disk") for count, scene in ((8, few), (32, many))}
+    in_memory = trained(tmp_path / "memory", many, "memory")
+    assert on_disk[32][1] == in_memory[1], "the same bits"
+    photo = 3 * 4 * SIZE[0] * SIZE[1]
+    assert in_memory[0] > 32 * photo
+    assert on_disk[32][0] <= on_disk[8][0] + 2 * photo
+
+
+def test_a_view_of_a_scene_that_holds_no_images_reads_them(tmp_path: Path) -> None:
+    path = masked_scene(tmp_path, 4)
+    held, read = (load_scene(path, progress=False, hold=hold) for hold in (True, False))
+    for view, other in zip(held.train, read.train, strict=True):
+        moved = other.at(replace(other.camera, fx=9.0))
+        for again in (other, moved):
+            assert again.masked
+            assert torch.equal(view.image, again.image)
+            assert view.mask is not None
+            assert again.mask is not None
+            assert torch.equal(view.mask, again.mask)
+        assert moved.camera.fx == 9.0
+        image = weakref.ref(other.image)
+        assert image() is None, "kept by nobody"
+    assert not View("a", ring_camera(0.0), torch.zeros(3, *SIZE[::-1])).masked
+
+
+def test_a_checkouts_photos_and_masks_wait_in_a_file_without_a_name(tmp_path: Path) -> None:
+    images = SceneImages()
+    images.keep_on_disk(tmp_path)
+
+    class Camera:
+        def __init__(self, image: torch.Tensor) -> None:
+            self.image_name, self.original_image = f"{len(image)}", image
+
+    Camera.__init__ = images.adopting(Camera.__init__)  # type: ignore[method-assign]
+    photos = [torch.randint(0, 256, (3, 5 + i, 7)) / 255 for i in range(5)] + [torch.rand(3, 4, 4).half().float()]
+    cameras = [Camera(photo.clone()) for photo in photos]
+    stored = [images[images.key(camera)] for camera in cameras]
+    for photo, kept in [*zip(photos, stored, strict=True)][::-1]:
+        assert isinstance(kept, FullSizeImage)
+        assert kept.size == (photo.shape[2], photo.shape[1])
+        assert torch.equal(kept.load(torch.device("cpu")), photo)
+        image = weakref.ref(kept.stored())
+        assert image() is None, "kept by nobody"
+    assert [kept.exact for kept in stored] == [True] * 5 + [False]
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("name", ["photos/03.png", "photos"])
+def test_photos_may_be_links(tmp_path: Path, name: str) -> None:
+    scene = write_scene(tmp_path / "scene")
+    expected = load_scene(scene, progress=False)
+    (scene / name).rename(tmp_path / "elsewhere")
+    (scene / name).symlink_to(tmp_path / "elsewhere")
+    read = load_scene(scene, progress=False)
+    assert all(torch.equal(a.image, b.image) for a, b in zip(expected.train, read.train, strict=True))
