@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import inspect
 import os
 import random
@@ -10,6 +11,7 @@ import tempfile
 import threading
 import weakref
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, wraps
 from pathlib import Path
@@ -92,6 +94,7 @@ class _NamelessFile:
             start = self._file.seek(0, os.SEEK_END)
             self._file.write(data)
             self._file.flush()
+        _return_free_memory()
 
         def read() -> Tensor:
             stored = torch.empty(shape, dtype=dtype)
@@ -101,6 +104,12 @@ class _NamelessFile:
             return stored
 
         return read
+
+
+def _return_free_memory() -> None:
+    """Return freed memory to the system. glibc keeps it where something smaller follows, such as each camera's mask."""
+    with suppress(AttributeError, OSError, TypeError):  # other C libraries have no such call
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class SceneImages:
@@ -159,6 +168,9 @@ class SceneImages:
             key = f"{len(self._images):05d}-{camera.image_name}"
             self._images[key] = stored
         del camera.original_image
+        mask = getattr(camera, "alpha_mask", None)
+        if isinstance(mask, Tensor) and _opaque(mask):
+            camera.alpha_mask = mask.new_ones(()).expand_as(mask)  # the same in four bytes; no level uses it
         setattr(camera, KEY, key)
 
     def read_masks(self, scene: Path, setting: str) -> None:
@@ -268,7 +280,7 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
             scaled[..., row, :] = scaled[..., row, :] * size[row] / full[row]
         return scaled
     if isinstance(value, Tensor) and value.shape[-2:] == full[::-1] and value.ndim > 1:
-        opaque = name == "alpha_mask" and bool((value == 1).all())
+        opaque = name == "alpha_mask" and _opaque(value)
         return None if opaque else shrunk(value, size)  # without a mask loops save a pass over the image
     if isinstance(value, (tuple, list)) and tuple(value) in (full, full[::-1]):
         return type(value)(size if tuple(value) == full else size[::-1])
@@ -276,6 +288,10 @@ def _at_level(name: str, value: Any, full: tuple[int, int], size: tuple[int, int
         axis, kind = SCALED[name.lower()], cast("Any", type(value))
         return kind(float(value) * size[axis] / full[axis]) if value != full[axis] else size[axis]
     return value
+
+
+def _opaque(mask: Tensor) -> bool:
+    return bool((mask == 1).all())
 
 
 def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
