@@ -91,7 +91,7 @@ def test_a_checkouts_photos_and_masks_wait_in_a_file_without_a_name(tmp_path: Pa
 
     class Camera:
         def __init__(self, image: torch.Tensor) -> None:
-            self.image_name, self.original_image = f"{len(image)}", image
+            self.image_name, self.original_image, self.alpha_mask = "photo", image, torch.ones_like(image[:1])
 
     Camera.__init__ = images.adopting(Camera.__init__)  # type: ignore[method-assign]
     photos = [torch.randint(0, 256, (3, 5 + i, 7)) / 255 for i in range(5)] + [torch.rand(3, 4, 4).half().float()]
@@ -103,6 +103,9 @@ def test_a_checkouts_photos_and_masks_wait_in_a_file_without_a_name(tmp_path: Pa
         assert torch.equal(kept.load(torch.device("cpu")), photo)
         image = weakref.ref(kept.stored())
         assert image() is None, "kept by nobody"
+    masks = [camera.alpha_mask for camera in cameras]
+    assert all(torch.equal(mask, torch.ones_like(photo[:1])) for mask, photo in zip(masks, photos, strict=True))
+    assert {mask.untyped_storage().nbytes() for mask in masks} == {4}
     assert [kept.exact for kept in stored] == [True] * 5 + [False]
     assert not [*tmp_path.iterdir()]
 
