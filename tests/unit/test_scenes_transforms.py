@@ -542,7 +542,7 @@ def test_coordinates_of_a_map_are_told(
         ({"file_path": "/"}, r"frame 4 \(/\) names a folder, expected the name of its image"),
         ({"file_path": ""}, r"frame 4 \(\) names a folder"),
         ({"file_path": "images/.."}, "names a folder"),
-        ({"file_path": "images"}, "images: no such image"),
+        ({"file_path": "images"}, "images cannot be read: Is a directory"),
         ({"file_path": "../../elsewhere.png"}, r"frame 4 .* names .*elsewhere\.png: no such image"),
         ({"file_path": "a\0b"}, r"a\\x00b: no such image"),
         ({"file_path": "\x1b[2Ja\nb\u202e.png"}, r"/\\x1b\[2Ja\\nb\\u202e\.png: no such image"),
