@@ -259,3 +259,20 @@ def test_a_store_is_not_made_through_a_link(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="is a link"):
         ResultStore.create(tmp_path / "results.sqlite")
     assert (tmp_path / "empty").read_bytes() == b""
+
+
+@pytest.mark.parametrize("name", ["folder", "log"])
+def test_no_run_is_written_through_a_link(tmp_path: Path, name: str) -> None:
+    (job,) = copying_jobs(tmp_path, 1)
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "file").write_text("precious")
+    path = Path(getattr(job, name))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.symlink_to(tmp_path / "precious" / ("" if name == "folder" else "file"))
+    store = ResultStore.create(tmp_path / "results.sqlite")
+    store.plan([job])
+    work(tmp_path / "results.sqlite", [job.run_id])
+    (outcome,) = store.outcomes([job.run_id])
+    assert outcome.state == FAILED
+    assert f"{path} is a link" in outcome.error
+    assert (tmp_path / "precious" / "file").read_text() == "precious"
