@@ -125,3 +125,35 @@ def test_a_path_of_a_billion_frames(
         for command in (("render", run), ("eval", run)):
             assert message in refused(monkeypatch, capfd, *command, *arguments)
     assert sorted(run.rglob("*")) == before
+
+
+@pytest.mark.parametrize("odd", ["loop", "pipe", "/dev/zero"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("prepare", "{odd}", "out"),
+        ("prepare", "scene/photos", "{odd}"),
+        ("prepare", "scene/photos", "out", "--masks", "{odd}"),
+        ("train", "{odd}", "-o", "out"),
+        ("train", "scene", "-o", "{odd}"),
+        ("train", "scene", "-o", "out", "--masks", "{odd}"),
+        ("train", "scene", "-o", "out", "--config", "{odd}"),
+        ("export", "{odd}"),
+        ("report", "{odd}"),
+        ("import-run", "{odd}"),
+    ],
+    ids=" ".join,
+)
+def test_links_to_themselves_pipes_and_devices_where_folders_are_expected(
+    command: tuple[str, ...],
+    odd: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path / "scene")
+    Path("loop").symlink_to("loop")
+    os.mkfifo("pipe")
+    assert odd in refused(monkeypatch, capfd, *(word.format(odd=odd) for word in command))
+    assert not Path("out").exists()

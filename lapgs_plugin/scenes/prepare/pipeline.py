@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +119,9 @@ def _undistort(given: Given, out: Path, overwrite: bool, progress: bool) -> Prep
 
 
 def _check_folders(photos: Path, out: Path, settings: PrepareSettings, overwrite: bool) -> None:
-    source, target = photos.resolve(), out.resolve()
+    source, target = (
+        Path(os.path.realpath(path)) for path in (photos, out)
+    )  # Path.resolve raises for a link to itself
     if source.is_relative_to(target) or target.is_relative_to(source):
         raise UserInputError(f"{out}: one of {photos} and {out} lies in the other; write OUT somewhere else")
     check_output(out, overwrite, WORK)
