@@ -17,6 +17,7 @@ import pycolmap
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import refuse_lfs_pointer
 from lapgs_plugin.scenes.colmap_records import LARGEST_ID, NO_FEATURES, Points, PosedImage, file_name
+from lapgs_plugin.untrusted import require_regular
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
@@ -30,7 +31,11 @@ class BinaryRecords:
     """The bytes of a file, taken one after the other. Bytes after the last record do not matter."""
 
     def __init__(self, file: Path) -> None:
-        self.data = file.read_bytes()
+        try:
+            require_regular(file)
+            self.data = file.read_bytes()
+        except OSError as error:
+            raise SceneError(f"{file} cannot be read: {error.strerror}; copy or export the model again") from error
         self.at = 0
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:

@@ -16,6 +16,7 @@ import pycolmap
 
 from lapgs_plugin.scenes.colmap_binary import BinaryRecords
 from lapgs_plugin.scenes.colmap_records import rigid
+from lapgs_plugin.untrusted import require_regular
 
 Take = Callable[[str], float]
 """Return the next value of a file, in a binary file of this format of `struct`."""
@@ -57,6 +58,7 @@ def _records(file: Path) -> Iterator[Take]:
         for _ in range(records.take_count()):
             yield lambda kind: float(records.take(struct.Struct(f"<{kind}"))[0])
     else:
+        require_regular(file)
         for line in file.read_text("utf-8-sig").splitlines():
             if words := line.partition("#")[0].split():
                 values = [float(SENSORS.get(word, word)) for word in words][::-1]

@@ -101,7 +101,9 @@ def _formats(folder: Path) -> tuple[str, list[Path]]:
     for suffix in ("bin", "txt"):
         if points and all(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES[:2]):
             return suffix, points
-    present = ", ".join(sorted(entry.name for entry in folder.iterdir() if entry.stem in MODEL_FILES))
+    present = ", ".join(
+        sorted(entry.name for entry in folder.iterdir() if entry.stem in MODEL_FILES and is_file(entry))
+    )
     raise SceneError(
         f"{folder}: the sparse model is incomplete, it has only {present}; "
         "expected cameras, images and points3D, all as .bin or all as .txt"

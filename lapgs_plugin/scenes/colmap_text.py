@@ -28,6 +28,7 @@ from lapgs_plugin.scenes.colmap_records import (
     PosedImage,
     file_name,
 )
+from lapgs_plugin.untrusted import require_regular
 
 SHOWN = 60
 """Characters of a line that are quoted in a message."""
@@ -77,6 +78,7 @@ def _lines(file: Path, first_words: int = -1) -> Iterator[_Line]:
         SceneError: the file is no text in UTF-8, with or without a byte-order mark.
     """
     try:
+        require_regular(file)
         with file.open(encoding="utf-8-sig") as stream:
             for number, text in enumerate(stream, start=1):
                 if (stripped := text.strip()) and not stripped.startswith("#"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import struct
 from collections.abc import Callable, Sequence
@@ -347,3 +348,19 @@ def test_colours_a_little_outside_of_their_range(tmp_path: Path, scale: float) -
     colors[7, 1] = 6.5
     write_ply(tmp_path / "a.ply", POINTS, scale * colors)
     np.testing.assert_allclose(read_point_cloud(tmp_path / "a.ply", "").rgb, colors, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_files_that_are_none(tmp_path: Path, name: str) -> None:
+    file = make_scene(tmp_path) / "sparse" / "0" / name
+    file.unlink()
+    with file.open("wb") as stream:
+        stream.truncate(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") + 1)  # takes no room on the disk
+    with pytest.raises(SceneError, match=f"{file} cannot be read: .* more than this machine's memory"):
+        load(tmp_path)
+    for aim in (name, "nowhere", "/dev/zero"):
+        file.unlink()
+        file.symlink_to(aim)
+        with pytest.raises(SceneError, match="sparse model is incomplete") as caught:
+            load(tmp_path)
+        assert name not in str(caught.value)
