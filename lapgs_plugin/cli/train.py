@@ -300,7 +300,7 @@ def _create(
         require_pruning(make_plan(size, chosen, photos), chosen)
 
     loaded = load_reference(reference, check, hold=settings.images_on != "disk")
-    found = replace(reference, path=str(Path(reference.path).absolute()), kind=loaded.kind)
+    found = replace(reference, path=str(Path(reference.path).absolute()), kind=loaded.kind, unit=loaded.unit)
     manifest = Manifest(scene=found, rasterizer=rasterizer, **chosen.for_manifest())
     return RunArchive.create(out, manifest, overwrite), loaded, chosen
 

@@ -16,8 +16,10 @@ from lapgs_plugin.hierarchy.settings import INHERIT_MODES, parse_inheritance
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
-SMALLEST_SQUARED_DISTANCE = 1e-7
-"""Least mean squared distance to the neighbours, in squared world units: points may coincide."""
+SAME_PLACE = 1e-4
+"""Points closer than this, in mean distances of all points from their median, are at one place."""
+SINGLE_SIZE = 1e-3
+"""Standard deviation of a Gaussian in world units if all points are at one place."""
 
 
 class Inherited(NamedTuple):
@@ -136,7 +138,7 @@ def _initial_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
             f"{len(means)} points, not all finite; expected at least one point with finite coordinates"
         )
     n, means = len(means), means.to(sh.dtype, copy=True)
-    log_scale = 0.5 * torch.log(mean_squared_distance(means).clamp_min(SMALLEST_SQUARED_DISTANCE))  # (n,)
+    log_scale = _spacing(means).log()  # (n,)
     quaternions = torch.zeros(n, 4, dtype=sh.dtype, device=sh.device)
     quaternions[:, 0] = 1.0
     return GaussianField(
@@ -147,6 +149,35 @@ def _initial_field(means: Tensor, sh: Tensor, signed: bool) -> GaussianField:
         sh=sh,
         signed=signed,
     )
+
+
+def _spacing(points: Tensor) -> Tensor:
+    """Return the root mean square distance from each point (n, 3) to the three nearest places of other points, (n,).
+
+    Copies of a point are no neighbours of it, or it would start too small to be seen.
+    """
+    first, place, cell = places_of(points)
+    squares = mean_squared_distance(points[first])[place]
+    return squares.sqrt().clamp_min(cell) if cell > 0.0 else torch.full_like(squares, SINGLE_SIZE)
+
+
+def places_of(points: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Find points that are at one place, to rounding.
+
+    Args:
+        points: (n, 3), n at least 1.
+
+    Returns:
+        The row of a point at each of k places (k,), the place of each point (n,), and the size of a place in the
+        units of the points, 0 if they are all at the same.
+    """
+    positions = points.detach().to("cpu", torch.float64).numpy()
+    away = positions - np.median(positions, axis=0)
+    cell = SAME_PLACE * float(np.linalg.norm(away, axis=1).mean())
+    cells = np.round(away / cell) if cell > 0.0 else away
+    _, first, place = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    first_rows, places = (torch.from_numpy(each.reshape(-1)).to(points.device) for each in (first, place))
+    return first_rows, places, cell
 
 
 def mean_squared_distance(points: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Container, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from lapgs_plugin.adapters.registry import rasterizer_owners
 from lapgs_plugin.environment.device import chosen_device
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.fields.units import in_unit
 from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
@@ -71,7 +72,7 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
     else:
         placed, why = _named(rasterizer, device, settings), "as asked for"
     _log_choice(manifest, placed, why)
-    return placed
+    return replace(placed, rasterizer=in_unit(placed.rasterizer, manifest.scene.unit))
 
 
 def _raster_settings(manifest: Manifest) -> dict[str, Any]:

@@ -69,6 +69,7 @@ class SceneReference:
         kind: "colmap" or "transforms".
         images: name of the image folder in a COLMAP scene.
         masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
+        unit: the length in the scene's units that is 1 for the rasterizer, see `scenes.Scene`.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -80,6 +81,7 @@ class SceneReference:
     kind: Name
     images: PathText = "images"
     masks: PathText = "none"
+    unit: Annotated[float, Field(gt=1e-30, lt=1e30)] = 1.0
 
     @classmethod
     def of(
@@ -93,7 +95,7 @@ class SceneReference:
             masks: "none" for a loop that ignores masks, "alpha", or the folder of masks.
         """
         path = str(scene.path.absolute())
-        return cls(path, resolution, bool(scene.test), scene.background, scene.kind, images, masks)
+        return cls(path, resolution, bool(scene.test), scene.background, scene.kind, images, masks, scene.unit)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,12 @@ from typing import Generic, TypeVar, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.units import unit_of_depth
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
@@ -38,6 +40,8 @@ from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
+SAMPLED_POINTS, SAMPLED_VIEWS = 10_000, 100
+"""Most points and views of which depths are measured."""
 EXTENT_MARGIN = 1.1
 FAR = 1e3
 """Distance of the cameras from the origin, in extents, from which on positions are rounded to a tenth of a pixel of 1K
@@ -114,6 +118,8 @@ class Scene:
         extent: size of the scene in world units as in 3DGS: 1.1 times the largest distance of a training camera from
             the mean of their centres.
         background: RGB in [0, 1] that transparent pixels were blended over.
+        unit: the length, in world units, that is 1 for rasterizers, whose near plane is at 0.2: a power of two, by the
+            median depth of the points; 1 for COLMAP's usual scenes.
     """
 
     path: Path
@@ -124,6 +130,7 @@ class Scene:
     colors: Tensor  # (n, 3)
     extent: float
     background: tuple[float, float, float]
+    unit: float = 1.0
 
     @property
     def smallest_size(self) -> tuple[int, int]:
@@ -222,6 +229,7 @@ def load_scene(
         colors=torch.from_numpy(source.colors).float().clamp(0.0, 1.0),
         extent=_extent(path, source.train),
         background=background,
+        unit=_unit(source.points, source.train),
     )
 
 
@@ -377,7 +385,7 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
     """Return `Scene.extent`."""
     centers = torch.stack([frame.camera.position for frame in train])  # (v, 3)
     extent = EXTENT_MARGIN * float((centers - centers.mean(dim=0)).norm(dim=1).max())
-    if extent <= 1e-9 * (1.0 + float(centers.abs().max())):  # only rounding apart
+    if extent <= 1e-9 * float(centers.abs().max()):  # only rounding apart
         raise SceneError(
             f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
         )
@@ -388,3 +396,19 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
             *(path, away, away / extent, np.spacing(np.float32(away))),
         )
     return extent
+
+
+def _unit(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
+    """Return `Scene.unit`; 1 if no camera sees a point."""
+    some = torch.from_numpy(points[:: len(points) // SAMPLED_POINTS + 1])
+    depths = [_depths_in_view(frame.camera, some) for frame in train[:: len(train) // SAMPLED_VIEWS + 1]]
+    median = float(torch.cat(depths).median()) if any(map(len, depths)) else 0.0
+    return unit_of_depth(median) if median > 0.0 else 1.0
+
+
+def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:
+    """Return the depths of those points (n, 3) that a camera sees, were none hidden."""
+    x, y, depths = camera.local(points).unbind(-1)
+    across, down = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
+    inside = (across > 0) & (across < camera.width) & (down > 0) & (down < camera.height)
+    return depths[(depths > 0) & inside]

@@ -16,7 +16,7 @@ from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.strategies import Gradients, Strategy
+from lapgs_plugin.training.strategies import USUAL_EXTENT, Gradients, Strategy
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class DensityControl:
     """Edit the field of one stage between iterations. Every method but `after_step` may be left as it is.
 
     Args:
-        opacity_weight, scale_weight: of the mean opacity and the mean standard deviation in the loss.
+        opacity_weight, scale_weight: of the mean opacity, and of the mean standard deviation in world units, in the
+            loss.
 
     Attributes:
         state: statistics it keeps between iterations, for checkpoints: numbers, or None for what becomes a tensor
@@ -134,7 +135,7 @@ class Densifier(DensityControl):
     """
 
     def __init__(self, schedule: StageSchedule, options: Gradients, extent: float) -> None:
-        super().__init__(options.opacity_weight, options.scale_weight)
+        super().__init__(options.opacity_weight, options.scale_weight * USUAL_EXTENT / extent)
         self._schedule = schedule
         self._strategy = DefaultStrategy(
             grow_grad2d=options.grow_grad2d,

@@ -24,7 +24,7 @@ from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
 from lapgs_plugin.training.densification import DensityControl, ViewScores, add_gradients
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
-from lapgs_plugin.training.strategies import Mcmc
+from lapgs_plugin.training.strategies import USUAL_EXTENT, Mcmc
 
 START_SCALE, START_OPACITY = 0.1, 0.5
 """Factor on the sizes, and opacity, of a field that starts from points, as MCMC's authors have them."""
@@ -73,10 +73,12 @@ class McmcDensifier(DensityControl):
     Args:
         schedule: when the stage adds and moves.
         options: of the stage, with its limit.
+        extent: scene extent in world units.
     """
 
-    def __init__(self, schedule: StageSchedule, options: Mcmc) -> None:
-        super().__init__(options.opacity_weight, options.scale_weight)
+    def __init__(self, schedule: StageSchedule, options: Mcmc, extent: float = USUAL_EXTENT) -> None:
+        self._unit = extent / USUAL_EXTENT
+        super().__init__(options.opacity_weight, options.scale_weight / self._unit)
         assert options.cap_max is not None, "`Mcmc.of_stage` sets it"
         self._schedule, self._most = schedule, options.cap_max
         # The last iteration with noise, and what has come up since; gradients since statistics began, and their views.
@@ -117,10 +119,10 @@ class McmcDensifier(DensityControl):
         rate = model.optimizers["means"].param_groups[0]["lr"]  # of the step just taken, scaled for its views
         self.state["variance"] += rate**2
         if iteration - self.state["noised"] >= NOISE_VIEWS:
-            shake(model, NOISE * math.sqrt(self.state["variance"]))
+            shake(model, NOISE * math.sqrt(self.state["variance"]) / self._unit**2)
             self.state |= {"noised": iteration, "variance": 0.0}
             if model.signed and is_large(camera.size):
-                bound_sizes(model, camera, MOST_SIGMA)
+                bound_sizes(model, camera, MOST_SIGMA, NEAR_DEPTH * self._unit)
         return refines
 
     def opacity_weight(self, model: TrainableField, iteration: int) -> float:
@@ -242,18 +244,19 @@ def shake(model: TrainableField, amount: float) -> None:
 
 
 @torch.no_grad()
-def bound_sizes(model: TrainableField, camera: Camera, most: float) -> None:
+def bound_sizes(model: TrainableField, camera: Camera, most: float, near: float = NEAR_DEPTH) -> None:
     """Shrink the Gaussians that a camera sees to standard deviations of at most `most` pixels of its image.
 
     Args:
         model: edited in place.
         camera: its longer focal length counts.
         most: above 0.
+        near: depth in world units from which on Gaussians are visible.
     """
     means, log_scales = model.params["means"], model.params["scales"]
     x, y, depths = camera.local(means).unbind(1)
     # The rasterizers' limits. Gaussians beyond them would be judged by a camera that they pass by.
     wide, high = (JACOBIAN_LIMIT * tangent for tangent in camera.tan_half_fov)
-    seen = (depths > NEAR_DEPTH) & (x.abs() < wide * depths) & (y.abs() < high * depths)
+    seen = (depths > near) & (x.abs() < wide * depths) & (y.abs() < high * depths)
     bounds = torch.where(seen, depths * (most / max(camera.fx, camera.fy)), torch.inf).log()
     torch.minimum(log_scales, bounds[:, None], out=log_scales)

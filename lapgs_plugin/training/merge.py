@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.units import in_unit
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
@@ -109,6 +110,7 @@ def merge_levels(
                 ) from None
             field = fitted.field(0)
         colors_fitted = archive.exposure(archive.available_levels[-1]) is not None
+        placed = replace(placed, rasterizer=in_unit(placed.rasterizer, manifest.scene.unit))
         return _measured(field, teacher, scene, placed, colors_fitted)
 
 

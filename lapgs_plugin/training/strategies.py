@@ -37,6 +37,9 @@ FREE_VIEWS = 80
 """Training views from which on MCMC's residuals have less of the weight of the mean opacity, in proportion to 1 /
 views. They start without colour, so that nothing holds their opacities against it, and lose detail; but few views do
 not show which detail is wrong elsewhere."""
+USUAL_EXTENT = 5.0
+"""Extent of COLMAP's scenes, on which constants with a length were chosen. A fifth of the scene's extent is their unit,
+so that a scene trains alike in any units."""
 LONG_RUN = 5_000
 """Iterations from which MCMC is better than 3DGS's heuristics: it starts from tiny Gaussians, and short runs end before
 they have grown."""
@@ -139,8 +142,8 @@ class Regularized(Strategy):
     )
     scale_regularization: float | None = option(
         None,
-        "Weight of the mean standard deviation of Gaussians in the loss, in world units. Default: 0.01 with --strategy "
-        "mcmc, else 0.",
+        "Weight of the mean standard deviation of Gaussians in the loss, in fifths of the scene's extent. Default: 0.01 "
+        "with --strategy mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )
@@ -288,7 +291,7 @@ class Mcmc(Regularized):
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
         from lapgs_plugin.training.mcmc import McmcDensifier
 
-        return McmcDensifier(schedule, self)
+        return McmcDensifier(schedule, self, extent)
 
 
 @dataclass(frozen=True)

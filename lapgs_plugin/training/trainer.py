@@ -13,6 +13,7 @@ import torch
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.fields.units import in_unit
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
@@ -61,7 +62,7 @@ class Trainer:
         scene: views, points and background.
         settings: of the run.
         archive: the run folder; its manifest has the same settings.
-        rasterizer: renders every field.
+        rasterizer: renders every field, in the unit of the manifest's scene.
         device: of the rasterizer and of training.
         user_hooks: called after the stock ones.
         monitor: shows progress.
@@ -99,7 +100,7 @@ class Trainer:
             aside=tuple(aside),
             settings=self.settings,
             archive=self.archive,
-            rasterizer=self.rasterizer,
+            rasterizer=in_unit(self.rasterizer, self.archive.manifest.scene.unit),
             device=self.device,
             monitor=self.monitor,
             plan=make_plan(self.scene.smallest_size, self.settings, len(views)),
@@ -286,7 +287,7 @@ class Trainer:
             images=images.targets,
             background=torch.zeros(3, device=self.device) if stage.signed else context.background,
             extent=context.scene.extent,
-            rasterizer=self.rasterizer,
+            rasterizer=context.rasterizer,
             hooks=self._hooks,
             model=model,
             densifier=control_of(self._strategy_of(stage), schedule, context.scene.extent),
