@@ -109,6 +109,7 @@ def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -
 
 def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
     """Write one field, merged or of a level (by default the finest), as a file or a page."""
+    from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
     from lapgs_plugin.rendering.run import run_cameras
     from lapgs_plugin.reports.splat_page import write_splat_page
 
@@ -129,7 +130,8 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
     _make(folder)
     # Pages of several levels can lie beside each other.
     path = folder / (PAGE if settings.level is None else f"{_level_name(archive, settings.level)}.html")
-    write_splat_page(field, path, archive.name, cameras, archive.manifest.scene.background)
+    scene = archive.manifest.scene
+    write_splat_page(field, path, archive.name, cameras, scene.background, NEAR_DEPTH * scene.unit)
     _print_written(path, field, ", opens in a browser without a network")
 
 

@@ -17,7 +17,7 @@ from lapgs_plugin.hierarchy.settings import INHERIT_MODES, parse_inheritance
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 SAME_PLACE = 1e-4
-"""Points closer than this, in mean distances of all points from their median, are at one place."""
+"""Points closer than this, in median distances of all points from their middle, are at one place."""
 SINGLE_SIZE = 1e-3
 """Standard deviation of a Gaussian in world units if all points are at one place."""
 
@@ -173,7 +173,8 @@ def places_of(points: Tensor) -> tuple[Tensor, Tensor, float]:
     """
     positions = points.detach().to("cpu", torch.float64).numpy()
     away = positions - np.median(positions, axis=0)
-    cell = SAME_PLACE * float(np.linalg.norm(away, axis=1).mean())
+    distances = np.linalg.norm(away, axis=1)
+    cell = SAME_PLACE * float(np.median(distances) or distances.mean())  # most points may be at one place
     cells = np.round(away / cell) if cell > 0.0 else away
     _, first, place = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     first_rows, places = (torch.from_numpy(each.reshape(-1)).to(points.device) for each in (first, place))

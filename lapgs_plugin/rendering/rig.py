@@ -94,7 +94,7 @@ def _rotation(camera: Camera) -> NDArray[np.float64]:
 def _nearest_to_axes(positions: NDArray[np.float64], forwards: NDArray[np.float64]) -> Vector:
     """Return the point with the least sum of squared distances to the lines positions + t * forwards, both (n, 3)."""
     spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
-    guess = positions.mean(axis=0) + max(spread, 1.0) * forwards.mean(axis=0)
+    guess = positions.mean(axis=0) + (spread or 1.0) * forwards.mean(axis=0)
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # (n, 3, 3)
     left = across.sum(axis=0) + RIDGE * len(positions) * np.eye(3)
     right = np.einsum("nij,nj->i", across, positions) + RIDGE * len(positions) * guess

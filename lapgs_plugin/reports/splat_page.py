@@ -15,6 +15,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.files import write_text
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.rendering.rig import Rig, forward
 from lapgs_plugin.reports.report import render_page
 
@@ -24,7 +25,12 @@ NEAREST_TARGET = 0.05
 
 
 def write_splat_page(
-    field: GaussianField, path: Path, title: str, cameras: Sequence[Camera], background: tuple[float, float, float]
+    field: GaussianField,
+    path: Path,
+    title: str,
+    cameras: Sequence[Camera],
+    background: tuple[float, float, float],
+    near: float = NEAR_DEPTH,
 ) -> None:
     """Write the page.
 
@@ -34,13 +40,14 @@ def write_splat_page(
         title: of the page.
         cameras: of the training views; the page starts at the first and turns around the point that all look at.
         background: RGB in [0, 1] behind the Gaussians.
+        near: least depth of Gaussians that are drawn, in world units.
 
     Raises:
         FieldError: the field is a residual, or holds NaN or inf.
         RunFolderError: the page cannot be written.
     """
     splats = base64.b64encode(splat_bytes(field)).decode()
-    start = json.dumps({**_start(cameras), "background": background})
+    start = json.dumps({**_start(cameras), "background": background, "near": near})
     # Base64 and our own JSON of numbers hold nothing to escape.
     write_text(path, render_page(TEMPLATE, title=title, start=Markup(start), splats=Markup(splats)))
 

@@ -3,8 +3,9 @@
 // z forward in the camera.
 
 const ROW = 1024;  // Gaussians in a row of the texture; each takes two texels of 16 bytes
-const NEAR = 0.2;  // as in 3DGS
 const BUCKETS = 65536;
+const START = JSON.parse(document.getElementById("start").textContent);
+const NEAR = START.near;  // the least depth that is drawn
 
 const VERTEX = `#version 300 es
 precision highp float;
@@ -287,7 +288,7 @@ class Viewer {
 const words = document.getElementById("words");
 try {
   const [bytes, count] = decode(document.getElementById("splats").textContent);
-  new Viewer(document.querySelector("canvas"), bytes, count, JSON.parse(document.getElementById("start").textContent));
+  new Viewer(document.querySelector("canvas"), bytes, count, START);
 } catch (error) {
   words.textContent = `The scene cannot be shown: ${error.message}`;
 }

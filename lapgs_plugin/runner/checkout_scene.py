@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.errors import SceneError, UserInputError, counted
+from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
 from lapgs_plugin.runner.object_values import with_values
 from lapgs_plugin.scenes.colmap import why_no_points
+from lapgs_plugin.scenes.scene import LEAST_PLACES, count_places, some_of
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,36 @@ class CheckoutScene:
         """Held-out cameras."""
         return list(self.scene.getTestCameras())
 
+    def check_points(self) -> None:
+        """Say if the rasterizer would draw few of the points that training starts from, or none.
+
+        Raises:
+            UserInputError: they are at too few places to have sizes.
+        """
+        points = torch.as_tensor(np.asarray(self.points.points)).float()  # (n, 3)
+        if (places := count_places(points) if len(points) else 0) < LEAST_PLACES:
+            raise UserInputError(
+                f"the scene has {counted(len(points), 'sparse point')} at {counted(places, 'place')}, expected points "
+                f"at {LEAST_PLACES} or more; reconstruct or export them again"
+            )
+        seen = [_depths_in_view(camera, some_of(points)) for camera in self.train]
+        near, ahead = sum(int((each <= NEAR_DEPTH).sum()) for each in seen), sum(map(len, seen))
+        if 2 * near > ahead:
+            factor = 10.0 ** math.ceil(math.log10(NEAR_DEPTH / float(torch.cat(seen).median())) + 1)
+            logger.warning(
+                "%d %% of the points in view are nearer to the cameras than %g, the near plane of 3DGS rasterizers, "
+                "which draw nothing there; `lapgs train` takes scenes of any size, or scale poses and points by %g",
+                *(100 * near // ahead, NEAR_DEPTH, factor),
+            )
+        dark = [camera for camera, depths in zip(self.train, seen, strict=True) if not (depths > NEAR_DEPTH).any()]
+        dark = [camera for camera in dark if not (_depths_in_view(camera, points) > NEAR_DEPTH).any()]
+        if dark:
+            logger.warning(
+                "no Gaussian will be visible at first in %d of %d training views, such as %s: no point is in front of "
+                "them; check that the points and the cameras are of one model",
+                *(len(dark), len(seen), dark[0].image_name),
+            )
+
     def copy(self, gaussians: Any, model_path: str, train: list[Any], test: list[Any]) -> Any:
         """Return the checkout's Scene with another model, output folder and cameras."""
         cameras = {"train_cameras": train, "test_cameras": test}
@@ -76,3 +116,13 @@ class _PointRecorder:
 
     def create_from_pcd(self, points: Any, *others: Any) -> None:
         self.points, self.others = points, others
+
+
+def _depths_in_view(camera: Any, points: Tensor) -> Tensor:
+    """Return the depths of those points (n, 3) that a checkout's camera would show, hidden ones among them."""
+    pose = camera.world_view_transform.detach().to("cpu", points.dtype)  # (4, 4), for rows
+    x, y, depths = (points @ pose[:3, :3] + pose[3, :3]).unbind(1)
+    tangents = [math.tan(getattr(camera, name, math.pi / 2) / 2) for name in ("FoVx", "FoVy")]
+    # Gaussians that are centred a little outside of the image reach into it.
+    inside = [each.abs() < JACOBIAN_LIMIT * tangent * depths for each, tangent in zip((x, y), tangents, strict=True)]
+    return depths[(depths > 0) & inside[0] & inside[1]]

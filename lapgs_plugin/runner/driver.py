@@ -141,6 +141,7 @@ class HierarchyDriver:
             self._context.images.keep_on_disk(next(filter(is_folder, (folder, *folder.parents))))
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
             scene = CheckoutScene.load(call, self._adapter, Path(scratch))
+            scene.check_points()
             self._context.images.read_masks(source, self._options.masks)
             self._adapter.first_points(len(scene.points.points))
             size = self._context.images.smallest_size()

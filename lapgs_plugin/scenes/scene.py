@@ -19,6 +19,7 @@ from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.units import unit_of_depth
 from lapgs_plugin.files import is_file, is_folder
+from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, places_of
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
@@ -40,6 +41,7 @@ from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
+LEAST_PLACES = NEIGHBOURS + 1
 SAMPLED_POINTS, SAMPLED_VIEWS = 10_000, 100
 """Most points and views of which depths are measured."""
 EXTENT_MARGIN = 1.1
@@ -354,6 +356,11 @@ def check_source(path: Path, source: SceneSource) -> None:
             f"{path}: a sparse point lies at {furthest:g}, expected at most {LARGEST:g}; reconstruct or export them "
             "again"
         )
+    if (places := count_places(torch.from_numpy(source.points))) < LEAST_PLACES:
+        raise SceneError(
+            f"{path}: {counted(len(source.points), 'sparse point')} at {counted(places, 'place')}, expected points at "
+            f"{LEAST_PLACES} or more; reconstruct or export them again"
+        )
     if not np.isfinite(source.colors).all():
         raise SceneError(
             f"{path}: colours of the sparse points hold NaN or inf, expected 0 to 255 or 0.0 to 1.0; export them again"
@@ -400,7 +407,7 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
 
 def _unit(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
     """Return `Scene.unit`; 1 if no camera sees a point."""
-    some = torch.from_numpy(points[:: len(points) // SAMPLED_POINTS + 1])
+    some = some_of(torch.from_numpy(points))
     depths = [_depths_in_view(frame.camera, some) for frame in train[:: len(train) // SAMPLED_VIEWS + 1]]
     median = float(torch.cat(depths).median()) if any(map(len, depths)) else 0.0
     return unit_of_depth(median) if median > 0.0 else 1.0
@@ -412,3 +419,14 @@ def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:
     across, down = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
     inside = (across > 0) & (across < camera.width) & (down > 0) & (down < camera.height)
     return depths[(depths > 0) & inside]
+
+
+def count_places(points: Tensor) -> int:
+    """Return at how many places points (n, 3) are, counted among some of them if these are at enough places."""
+    places = len(places_of(some_of(points))[0])
+    return places if places >= LEAST_PLACES else len(places_of(points)[0])
+
+
+def some_of(points: Tensor) -> Tensor:
+    """Return at most `SAMPLED_POINTS` of some points (n, 3)."""
+    return points[:: len(points) // SAMPLED_POINTS + 1]

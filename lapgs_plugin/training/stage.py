@@ -219,6 +219,11 @@ class StageRun:
         """Number of losses that are read together."""
         return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
 
+    @property
+    def first_view(self) -> LevelView:
+        """The view that the stage's first iteration renders."""
+        return at_pose(self._view(1), self.poses)
+
     def _next(self, done: int) -> range:
         """Return the iterations of the step after `done` ones."""
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))

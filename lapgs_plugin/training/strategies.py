@@ -142,8 +142,8 @@ class Regularized(Strategy):
     )
     scale_regularization: float | None = option(
         None,
-        "Weight of the mean standard deviation of Gaussians in the loss, in fifths of the scene's extent. Default: 0.01 "
-        "with --strategy mcmc, else 0.",
+        "Weight of the mean standard deviation of Gaussians in the loss, in fifths of the scene's extent. Default: "
+        "0.01 with --strategy mcmc, else 0.",
         panel=PANEL,
         least=0.0,
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.errors import DeviceMemoryError, UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, UserInputError, counted
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
@@ -19,6 +19,7 @@ from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT
@@ -210,6 +211,8 @@ class Trainer:
             if before is not None and checkpoint is None and aside:
                 evaluation.note_best(run)  # the finished run's state is the one to beat
             self.monitor.stage_started(run.stage, run.progress.iteration + 1)
+            if checkpoint is None:
+                self._say_if_nothing_is_visible(run)
             between_steps = BetweenSteps(
                 context=self._context,
                 evaluation=evaluation,
@@ -227,6 +230,18 @@ class Trainer:
             evaluation.return_to_best(run)
             self._archive_stage(run, before, overhead, memory.note(images.bytes_on_device))
             self.watcher.stage_finished(run.stage, lambda: run.fields)
+
+    @torch.no_grad()
+    def _say_if_nothing_is_visible(self, run: StageRun) -> None:
+        """Tell the user if the view that a stage renders first shows no Gaussian, which would train to black."""
+        view, near = run.first_view, NEAR_DEPTH * self.archive.manifest.scene.unit
+        result = self._context.rasterizer(run.model.field, view.camera, background=run.background, sh_degree=0)
+        if not bool(result.radii.any()):
+            self.monitor.say(
+                f"level {run.stage.level}: none of {counted(len(run.model), 'Gaussian')} is visible in {view.name}, the"
+                f" first view: all are outside of it, behind it, or less than {near:.3g} in front of it; check that the "
+                "points and the cameras are of one model"
+            )
 
     def _model(self, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead) -> TrainableField:
         """Return the field to train, from the checkpoint or as a stage starts with it."""
