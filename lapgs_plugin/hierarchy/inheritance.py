@@ -18,8 +18,8 @@ INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 SAME_PLACE = 1e-4
 """Points closer than this, in median distances of all points from their middle, are at one place."""
-SINGLE_SIZE = 1e-3
-"""Standard deviation of a Gaussian in world units if all points are at one place."""
+SINGLE_SIZE = math.sqrt(1e-7)
+"""Standard deviation of a Gaussian in world units if all points are at one place: 3DGS's least."""
 
 
 class Inherited(NamedTuple):

@@ -37,6 +37,7 @@ from lapgs_plugin.reports.pictures import Strip, make_strip
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
 from lapgs_plugin.runs.results import MEASURED
+from lapgs_plugin.runs.training_figures import weak_levels
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = "report.html.jinja"
@@ -99,6 +100,11 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         rows=comparison_rows([each.metrics for each in runs]),
         charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,
+        weak=weak_levels(
+            run.archive.manifest.records,
+            {int(level): figures["upsampled_psnr"] for level, figures in run.metrics["levels"].items()},
+            MEASURED[run.metrics["split"]],
+        ),
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
         strips=view_strips(run, renderers, options.scene),

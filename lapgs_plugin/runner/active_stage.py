@@ -32,6 +32,7 @@ from lapgs_plugin.runner.stage_record import StageRecord
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
+from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
 
 logger = logging.getLogger(__name__)
 
@@ -209,8 +210,11 @@ class ActiveStage:
         self._require_finite({self.stage.level: field, **(joint or {})})
         result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
         self.record.archive(result, joint)
-        if self._views.test and (self.stage.level == 0 or self._context.measuring.test_every is not None):
+        if self._views.test and (self.stage.level <= 1 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
+        psnr = last_psnr(self._archive.history()) if self.stage.level == 0 else {}
+        for line in weak_levels(self._archive.manifest.records[-1:], psnr):
+            logger.warning("%s", line)
         self._compare(gaussians, field)
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result

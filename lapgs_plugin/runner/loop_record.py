@@ -22,7 +22,7 @@ class LoopRecord:
     Attributes:
         overhead: seconds beside optimization, by purpose.
         iteration: running iteration, from 1; 0 before the first.
-        peak: most Gaussians at the start of an iteration.
+        first, peak: Gaussians at the start of the first iteration, and most at that of any.
         seconds: of optimization, once the loop has ended.
         memory_bytes: see `PeakMemory.note`.
     """
@@ -30,7 +30,7 @@ class LoopRecord:
     def __init__(self, device: torch.device, profiled: int = 0) -> None:
         self._device, self._busy = device, GpuBusy(profiled)
         self.overhead = Overhead(settle=self._synchronize)
-        self.iteration = self.peak = 0
+        self.iteration = self.first = self.peak = 0
         self.seconds = 0.0
         self.memory_bytes: dict[str, int] = {}
         self._gaussian_steps = 0  # Gaussians, summed over the iterations
@@ -51,6 +51,7 @@ class LoopRecord:
     def count(self, iteration: int, gaussians: int) -> None:
         """Note the number of Gaussians of an iteration that is about to begin."""
         self._profile(iteration - 1)
+        self.first = self.first or gaussians
         self.iteration = iteration
         self.peak = max(self.peak, gaussians)
         self._gaussian_steps += gaussians

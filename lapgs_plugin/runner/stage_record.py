@@ -75,6 +75,7 @@ class StageRecord(LoopRecord):
                 mean_gaussians=self.mean_gaussians,
                 breakdown_seconds=self._parts.breakdown.seconds(),
                 gpu_busy_seconds=self.gpu_busy_seconds,
+                start_gaussians=self.first,
             ),
             field,
             inherited if stage.level > 0 and any(inherited.values()) else None,

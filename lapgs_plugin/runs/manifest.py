@@ -116,6 +116,7 @@ class LevelRecord:
         mean_gaussians: Gaussians being optimized, mean over the iterations; None when that was not recorded.
         breakdown_seconds: optimization by part of an iteration (`profiling.PARTS`); empty when not measured.
         gpu_busy_seconds: estimate of the seconds that the GPU executed kernels; None when not measured.
+        start_gaussians: Gaussians before its first iteration; None when that was not recorded.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -132,6 +133,7 @@ class LevelRecord:
     mean_gaussians: NonNegativeFloat | None = None
     breakdown_seconds: dict[str, NonNegativeFloat] = field(default_factory=dict)
     gpu_busy_seconds: NonNegativeFloat | None = None
+    start_gaussians: NonNegativeInt | None = None
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:

@@ -11,6 +11,38 @@ from typing import Any
 
 from lapgs_plugin.runs.manifest import LevelRecord
 
+FEW_LEFT = 0.1
+"""Share of the Gaussians that a level started with, below which its end is reported."""
+SMALL_GAIN = 0.1
+"""Decibels that the finest level should add to the PSNR of whole images."""
+
+
+def weak_levels(records: Sequence[LevelRecord], psnr: Mapping[int, float], views: str = "held-out") -> list[str]:
+    """Return a line for each level that lost nearly all of its Gaussians, and one if the finest hardly matters.
+
+    Args:
+        records: of finished levels.
+        psnr: of whole images after each level, in dB, as far as it was measured.
+        views: which views were measured.
+    """
+    lines = [
+        f"level {record.level} ended with {record.num_gaussians:,} of the {record.start_gaussians:,} Gaussians that it "
+        "started with: hardly any of its detail is in the image; compare with a run of other --levels or --hierarchy"
+        for record in records
+        if record.start_gaussians is not None and record.num_gaussians < FEW_LEFT * record.start_gaussians
+    ]
+    if psnr.keys() >= {0, 1} and (gain := psnr[0] - psnr[1]) < SMALL_GAIN:
+        lines.append(
+            f"level 0 changes the PSNR of {views} images by {gain:+.2f} dB, from {psnr[1]:.2f} to {psnr[0]:.2f}: they "
+            "are little more than the coarser level's, enlarged; compare with a run of other --levels or --hierarchy"
+        )
+    return lines
+
+
+def last_psnr(history: Iterable[Mapping[str, Any]]) -> dict[int, float]:
+    """Return the last PSNR of all held-out views by level, from the entries of a run's history."""
+    return {entry["level"]: entry["psnr"] for entry in history if "psnr" in entry}
+
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     """Return the figures of finished levels as JSON, with levels as text as JSON requires.

@@ -180,6 +180,11 @@ def load_scene(
     path = Path(path)
     masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
+    if (places := count_places(torch.from_numpy(source.points))) < LEAST_PLACES:
+        raise SceneError(
+            f"{path}: {counted(len(source.points), 'sparse point')} at {counted(places, 'place')}, expected points at "
+            f"{LEAST_PLACES} or more; reconstruct or export them again"
+        )
     for warning in source.warnings:
         logger.warning(warning)
     frames = [*source.train, *source.test]
@@ -355,11 +360,6 @@ def check_source(path: Path, source: SceneSource) -> None:
         raise SceneError(
             f"{path}: a sparse point lies at {furthest:g}, expected at most {LARGEST:g}; reconstruct or export them "
             "again"
-        )
-    if (places := count_places(torch.from_numpy(source.points))) < LEAST_PLACES:
-        raise SceneError(
-            f"{path}: {counted(len(source.points), 'sparse point')} at {counted(places, 'place')}, expected points at "
-            f"{LEAST_PLACES} or more; reconstruct or export them again"
         )
     if not np.isfinite(source.colors).all():
         raise SceneError(

@@ -48,6 +48,7 @@ class ProgressState(_State):
     peak_gaussians: NonNegativeInt
     gaussian_steps: NonNegativeInt
     most_views: NotRequired[PositiveInt | None]
+    start_gaussians: NotRequired[NonNegativeInt | None]
 
 
 class ModelState(_State):

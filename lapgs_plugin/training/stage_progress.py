@@ -22,6 +22,7 @@ class StageProgress:
         peak_gaussians: most Gaussians optimized at once in this stage.
         gaussian_steps: Gaussians optimized, summed over the iterations.
         most_views: views in one launch that fit into the GPU's memory; None as long as all have.
+        start_gaussians: number of Gaussians of the field before the first iteration; None if an older version began.
     """
 
     iteration: int = 0
@@ -30,13 +31,15 @@ class StageProgress:
     peak_gaussians: int = 0
     gaussian_steps: int = 0
     most_views: int | None = None
+    start_gaussians: int | None = None
 
     @classmethod
     def of(cls, record: LevelRecord) -> StageProgress:
         """Return the progress at the end of a finished stage, whose smoothed loss is not kept."""
         mean = record.num_gaussians if record.mean_gaussians is None else record.mean_gaussians
         steps = round(mean * record.iterations)
-        return cls(record.iterations, record.train_seconds, math.nan, record.peak_gaussians, steps)
+        start = record.start_gaussians
+        return cls(record.iterations, record.train_seconds, math.nan, record.peak_gaussians, steps, None, start)
 
     def add_loss(self, loss: float, views: int) -> None:
         """Add the mean loss of some views to the smoothed loss."""

@@ -25,6 +25,7 @@ from lapgs_plugin.runs.gpu_busy import GpuBusy, require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
+from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.between_steps import BetweenSteps
@@ -238,9 +239,9 @@ class Trainer:
         result = self._context.rasterizer(run.model.field, view.camera, background=run.background, sh_degree=0)
         if not bool(result.radii.any()):
             self.monitor.say(
-                f"level {run.stage.level}: none of {counted(len(run.model), 'Gaussian')} is visible in {view.name}, the"
-                f" first view: all are outside of it, behind it, or less than {near:.3g} in front of it; check that the "
-                "points and the cameras are of one model"
+                f"level {run.stage.level}: none of {counted(len(run.model), 'Gaussian')} is visible in {view.name}, "
+                f"the first view: all are outside of it, behind it, or less than {near:.3g} in front of it; check that "
+                "the points and the cameras are of one model"
             )
 
     def _model(self, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead) -> TrainableField:
@@ -311,7 +312,7 @@ class Trainer:
             poses=poses,
             batches=self._batches,
             breakdown=breakdown,
-            progress=StageProgress() if before is None else StageProgress.of(before),
+            progress=StageProgress(start_gaussians=len(model)) if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if self.gpu_busy else 0),
             say=self.monitor.say,
         )
@@ -359,6 +360,7 @@ class Trainer:
             mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
             breakdown_seconds=run.breakdown.seconds(),
             gpu_busy_seconds=run.busy.seconds(),
+            start_gaussians=run.progress.start_gaussians,
         )
         joint = run.coarser.joint
         along = {} if joint is None else joint.fields
@@ -371,3 +373,5 @@ class Trainer:
         else:
             extended = {"iterations": self.settings.iterations, "extended": self.settings.extended}
             self.archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, extended)
+        for line in weak_levels([record], last_psnr(self.archive.history()) if stage.level == 0 else {}):
+            self.monitor.say(line)

@@ -189,7 +189,7 @@ def test_what_is_rendered_has_to_be_what_is_archived(
     ):
         drive(adapter, dry_run=True, hierarchy=hierarchy)
     warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
-    assert [bool(re.match(message, each)) for each in warnings] == ([] if signed else [True])
+    assert sum(bool(re.match(message, each)) for each in warnings) == (not signed)
     assert (tmp_path / "run").exists() == (late or not signed)
     if late and signed:
         assert RunArchive.open(tmp_path / "run").available_levels == (1,)

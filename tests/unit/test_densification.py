@@ -92,7 +92,9 @@ def test_regularization_is_a_mean_of_opacities_and_sizes(options: Regularized, o
         assert (gradients[1] == 0.25).all()
         return
     logits, log_scales = field.opacity_logits.double().requires_grad_(), field.log_scales.double().requires_grad_()
-    term = opacity * (1 / (1 + (-logits).exp())).sum() / 7 + scale * log_scales.exp().sum() / 21
+    term = (
+        opacity * (1 / (1 + (-logits).exp())).sum() / 7 + scale * (5 / EXTENT) * log_scales.exp().sum() / 21
+    )  # sizes in fifths of the extent
     expected = torch.autograd.grad(3 * term, (logits, log_scales), materialize_grads=True)
     for found, wanted, before in zip(gradients, expected, (0.0, 0.25), strict=True):
         assert found is not None

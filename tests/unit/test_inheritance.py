@@ -31,12 +31,12 @@ def base_field(n: int = 50, degree: int = 2, signed: bool = False) -> GaussianFi
 
 
 def spacing_by_brute_force(points: np.ndarray) -> np.ndarray:
-    """Return the root mean squared distance to the three nearest others, pair by pair in float64."""
+    """Return the root mean squared distance to the three nearest other places, pair by pair in float64."""
     points = points.astype(np.float64)
     result = []
-    for i, point in enumerate(points):
-        squared = sorted(float(((point - other) ** 2).sum()) for j, other in enumerate(points) if j != i)[:3]
-        result.append(math.sqrt(max(np.mean(squared) if squared else 0.0, 1e-7)))
+    for point in points:
+        squared = sorted({float(((point - other) ** 2).sum()) for other in np.unique(points, axis=0)} - {0.0})[:3]
+        result.append(math.sqrt(np.mean(squared)) if squared else FLOOR)
     return np.array(result)
 
 

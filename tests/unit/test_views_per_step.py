@@ -326,7 +326,8 @@ def test_regularization_counts_for_each_view_of_a_step(
         found = seen[0]
         seen.clear()
         logits, log_scales = (found[name][0].double().requires_grad_() for name in ("opacities", "scales"))
-        term = weight * logits.sigmoid().mean() + 2 * weight * log_scales.exp().mean()
+        sizes = log_scales.exp().mean() * 5 / scene.extent  # in fifths of the extent
+        term = weight * logits.sigmoid().mean() + 2 * weight * sizes
         expected = torch.autograd.grad(4 * term, (logits, log_scales))
         if weight == 0.0:
             plain = found
