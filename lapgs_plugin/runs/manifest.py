@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -208,6 +208,7 @@ class Manifest:
         grid: str = "camera",
         inherit: str = "geometry",
         sh_degree: int = 3,
+        unit: float = 1.0,
     ) -> Manifest:
         """Return the manifest of a run that your own loop trains, supervised by composed images.
 
@@ -222,6 +223,7 @@ class Manifest:
             grid: of the loop's `Pyramid`, "camera" or "even".
             inherit: how residuals started, "geometry", "xyz" or "full".
             sh_degree: highest of the fields, 0 to 3.
+            unit: of the loop's rasterizer, `Scene.unit` if it is wrapped in `fields.units.in_unit`.
 
         Raises:
             UserInputError: one of these is something else.
@@ -234,7 +236,8 @@ class Manifest:
             raise UserInputError(f"grid {grid}: expected {' or '.join(GRIDS)}")
         require_degree(sh_degree)
         settings = {"hierarchy": Hierarchy(hierarchy).value}
-        return cls(scene, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings=settings)
+        reference = replace(scene, unit=unit)
+        return cls(reference, levels, grid, "reconstructed", inherit, sh_degree, rasterizer, seed=0, settings=settings)
 
     @property
     def complete(self) -> bool:

@@ -95,6 +95,21 @@ def test_the_page_needs_nothing_else(run: Path, baseline: Path) -> None:
     assert "prefers-color-scheme: dark" in text
 
 
+def test_a_level_that_lost_its_gaussians_and_one_that_changes_little_are_said(run: Path) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    for record in manifest["records"]:
+        record["start_gaussians"] = 10 * record["num_gaussians"] + (record["level"] == 0)
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    lapgs_report(run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    gain = metrics["levels"]["0"]["upsampled_psnr"] - metrics["levels"]["1"]["upsampled_psnr"]
+    text = Page((run / "report.html").read_text()).text
+    assert "Level 0 ended with 200 of the 2,001 Gaussians" in text
+    assert "evel 1 ended" not in text
+    assert gain < 0.1, "of fields that were never trained"
+    assert f"Level 0 changes the PSNR of held-out images by {gain:+.2f} dB" in text
+
+
 def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) -> None:
     lapgs_report(run, "--baseline", baseline)
     images = [image for image in Page((run / "report.html").read_text()).all("img") if "src" in image]

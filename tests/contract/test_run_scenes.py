@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from PIL import Image
@@ -20,6 +21,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.rasterizers.signed_color import signed_degree
+from lapgs_plugin.runs import training_figures
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
@@ -304,3 +306,28 @@ def test_a_fork_without_an_option_for_held_out_views(scene: Path, tmp_path: Path
         adapter.train.ModelParams.extract = without
         drive(adapter, levels=1)
     assert RunArchive.open(tmp_path / "run").manifest.scene.eval
+
+
+@pytest.mark.parametrize("hierarchy", ["nested", "laplacian"])
+def test_a_level_says_if_it_lost_its_gaussians_or_changes_little(
+    hierarchy: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(training_figures, "FEW_LEFT", 100.0)
+    monkeypatch.setattr(training_figures, "SMALL_GAIN", 100.0)
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 12, hierarchy=hierarchy)
+    first = archive.manifest.records[0]
+    assert first.start_gaussians == 300
+    lines = [record.getMessage() for record in caplog.records]
+    assert f"level 1 ended with {first.num_gaussians} of the 300 Gaussians" in "\n".join(lines)
+    assert any(line.startswith("level 0 changes the PSNR of held-out images by") for line in lines)
+
+
+def test_a_scene_in_small_units_is_said(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    small = Path(shutil.copytree(scene, tmp_path / "small"))
+    model = pycolmap.Reconstruction(str(small / "sparse/0"))
+    model.transform(pycolmap.Sim3d(1e-3, pycolmap.Rotation3d(), np.zeros(3)))
+    model.write_binary(str(small / "sparse/0"))
+    run_hierarchy(STUBS["graphdeco"], small, tmp_path / "run", "--iterations", 4, levels=1)
+    lines = "\n".join(record.getMessage() for record in caplog.records)
+    assert "nearer to the cameras than 0.2, the near plane" in lines
+    assert "no Gaussian will be visible at first in 10 of 10 training views" in lines

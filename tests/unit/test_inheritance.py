@@ -35,7 +35,8 @@ def spacing_by_brute_force(points: np.ndarray) -> np.ndarray:
     points = points.astype(np.float64)
     result = []
     for point in points:
-        squared = sorted({float(((point - other) ** 2).sum()) for other in np.unique(points, axis=0)} - {0.0})[:3]
+        others = [float(((point - other) ** 2).sum()) for other in np.unique(points, axis=0)]
+        squared = sorted(square for square in others if square > 0.0)[:3]
         result.append(math.sqrt(np.mean(squared)) if squared else FLOOR)
     return np.array(result)
 
