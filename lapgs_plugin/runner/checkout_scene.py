@@ -121,7 +121,8 @@ class _PointRecorder:
 def _depths_in_view(camera: Any, points: Tensor) -> Tensor:
     """Return the depths of those points (n, 3) that a checkout's camera would show, hidden ones among them."""
     pose = camera.world_view_transform.detach().to("cpu", points.dtype)  # (4, 4), for rows
-    x, y, depths = (points @ pose[:3, :3] + pose[3, :3]).unbind(1)
+    local: Tensor = points @ pose[:3, :3] + pose[3, :3]
+    x, y, depths = local.unbind(1)
     tangents = [math.tan(getattr(camera, name, math.pi / 2) / 2) for name in ("FoVx", "FoVy")]
     # Gaussians that are centred a little outside of the image reach into it.
     inside = [each.abs() < JACOBIAN_LIMIT * tangent * depths for each, tangent in zip((x, y), tangents, strict=True)]

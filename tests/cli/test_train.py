@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pycolmap
 import pytest
 
 from lapgs_plugin.cli import app
 from lapgs_plugin.cli.train import long_on_a_cpu
 from lapgs_plugin.files import LOCK, MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.viewer.preview import read_preview
 from tests.cli.run_folder import write_run, write_scene
@@ -196,3 +199,26 @@ def test_ctrl_c_leaves_a_run_that_resumes(
     assert "--iterations asks for 500" in other.stderr
     assert lapgs("train", *options, "-o", run, "--resume").returncode == 0
     assert RunArchive.open(run).manifest.complete
+
+
+def test_a_scene_in_small_units_is_trained_resumed_measured_and_exported(
+    lapgs: Lapgs, scene: Path, tmp_path: Path
+) -> None:
+    small, run = Path(shutil.copytree(scene, tmp_path / "small")), tmp_path / "run"
+    model = pycolmap.Reconstruction(str(small / "sparse/0"))
+    model.transform(pycolmap.Sim3d(1e-3, pycolmap.Rotation3d(), np.zeros(3)))
+    model.write_binary(str(small / "sparse/0"))
+    options = ("--eval", "--levels", "1", "--exposure", "off")
+    assert lapgs("train", small, "-o", run, *SHORT, *options).returncode == 0
+    unit = json.loads((run / MANIFEST).read_text())["scene"]["unit"]
+    assert unit == load_scene(small, progress=False).unit < 1e-2
+    assert lapgs("train", small, "-o", run, "--resume", "--iterations", "60").returncode == 0
+    assert lapgs("eval", run, "--lpips", "none").returncode == 0
+    assert json.loads((run / "metrics.json").read_text())["psnr"] > 12.0, "trained and rendered, and not black"
+    spread = (
+        RunArchive.open(run).field(0).means.norm(dim=1).median()
+        / load_scene(scene, progress=False).points.norm(dim=1).median()
+    )
+    assert float(spread) == pytest.approx(1e-3, rel=0.2)  # in the user's units
+    assert lapgs("export", run, "--html").returncode == 0
+    assert f'"near": {0.2 * unit}' in (run / "export" / "scene.html").read_text()
