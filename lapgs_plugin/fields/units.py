@@ -95,8 +95,9 @@ class InUnit(Rasterizer):
         """Return a camera's copy, always the same object: rasterizers know training cameras by that."""
         known = self._cameras.get(id(camera))
         if known is None or known[0]() is not camera:
-            pose = camera.world_to_camera.clone()
-            pose[:3, 3] /= self._unit
+            with torch.inference_mode(False):  # kept for later calls, which may need gradients
+                pose = camera.world_to_camera.clone()
+                pose[:3, 3] /= self._unit
             key, cache = id(camera), self._cameras
             reference = weakref.ref(camera, lambda _: cache.pop(key, None))
             known = cache[key] = reference, replace(camera, world_to_camera=pose)

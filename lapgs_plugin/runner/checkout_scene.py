@@ -81,7 +81,7 @@ class CheckoutScene:
             UserInputError: they are at too few places to have sizes.
         """
         points = torch.as_tensor(np.asarray(self.points.points)).float()  # (n, 3)
-        if (places := count_places(points) if len(points) else 0) < LEAST_PLACES:
+        if (places := count_places(points)) < LEAST_PLACES:
             raise UserInputError(
                 f"the scene has {counted(len(points), 'sparse point')} at {counted(places, 'place')}, expected points "
                 f"at {LEAST_PLACES} or more; reconstruct or export them again"
@@ -99,8 +99,8 @@ class CheckoutScene:
         dark = [camera for camera in dark if not (_depths_in_view(camera, points) > NEAR_DEPTH).any()]
         if dark:
             logger.warning(
-                "no Gaussian will be visible at first in %d of %d training views, such as %s: no point is in front of "
-                "them; check that the points and the cameras are of one model",
+                "no Gaussian will be visible at first in %d of %d training views, such as %s; check that the points and "
+                "the cameras are of one model",
                 *(len(dark), len(seen), dark[0].image_name),
             )
 
