@@ -99,8 +99,8 @@ class CheckoutScene:
         dark = [camera for camera in dark if not (_depths_in_view(camera, points) > NEAR_DEPTH).any()]
         if dark:
             logger.warning(
-                "no Gaussian will be visible at first in %d of %d training views, such as %s; check that the points and "
-                "the cameras are of one model",
+                "no Gaussian will be visible at first in %d of %d training views, such as %s; check that the points "
+                "and the cameras are of one model",
                 *(len(dark), len(seen), dark[0].image_name),
             )
 
