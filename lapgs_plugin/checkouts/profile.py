@@ -19,12 +19,9 @@ from typing import Any
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.script import Script
-from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource
+from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, SCENE_ROLES, CheckoutSource
 from lapgs_plugin.checkouts.syntax import plain_assignments
 from lapgs_plugin.errors import UserInputError
-
-SCENE_ROLES = ("getTrainCameras", "getTestCameras")
-"""Methods by which the class of a scene is recognised."""
 
 CAMERA_ROLES = {"world_view_transform", "image_name"}
 """Attributes that a camera with an image sets when it is made; a viewer's cameras have no image."""

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lapgs_plugin.checkouts.conditions import Branches, constant_arguments, default_options
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import (
     called_methods,
@@ -24,8 +25,20 @@ from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import as_pip_argument
 
-MODEL_ROLES = ("get_xyz", "training_setup")
+SETUP = "training_setup"
+"""Method of the Gaussians that makes their optimizer."""
+
+MODEL_ROLES = ("get_xyz", SETUP)
 """Methods by which the class of the Gaussians is recognised."""
+
+SCENE_ROLES = ("getTrainCameras", "getTestCameras")
+"""Methods by which the class of a scene is recognised."""
+
+START = "create_from_pcd"
+"""Method of the family's models that makes Gaussians of a scene's points."""
+
+FROM_RUN = "load_iteration"
+"""Argument of the family's scenes that says which finished model they read."""
 
 SCALES = re.compile(r"\w*scal.*\.repeat\(1, ([0-9])\).*", re.DOTALL)
 """Statement by which models of the family give a point one scale along each of its axes."""
@@ -84,7 +97,8 @@ class CheckoutSource:
         root: folder of the checkout; the script may lie in a folder below it.
         modules: files of the checkout's modules that the script imports, directly or not.
         externals: modules that these import from elsewhere.
-        model: class of the Gaussians, and its file and line.
+        model: class of the Gaussians, and its file and line: the first of `models` where the sources do not tell it.
+        models: classes that the script may make its model of, as `model`.
         rasterizers: how rasterizers are used.
         training: the script's function that trains.
     """
@@ -94,6 +108,7 @@ class CheckoutSource:
     modules: Mapping[str, Path]
     externals: tuple[External, ...]
     model: tuple[str, str]
+    models: tuple[tuple[str, str], ...]
     rasterizers: tuple[RasterizerUse, ...]
     training: ast.FunctionDef = field(repr=False)
 
@@ -117,19 +132,18 @@ class CheckoutSource:
     @classmethod
     def _read(cls, script: Path, given: Path) -> CheckoutSource:
         tree = parsed(script)
-        near = ""
+        near, training = "", _find_training(tree)
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
             modules = dict(_reachable(script, (script.parent, root)))
-            found, close = _find_model(modules, root, called_names(ast.walk(tree)))
+            models, close = _find_models(modules, root)
             near = near or close
-            if found is not None:
+            if models:
                 break
         else:
             raise UserInputError(
                 f"{given} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
                 f"with {' and '.join(MODEL_ROLES)}; {OTHERWISE}"
             )
-        training = _find_training(tree)
         if training is None:
             raise UserInputError(
                 f"{given} has no function that its main block calls and that calls backward(), expected a function "
@@ -137,7 +151,11 @@ class CheckoutSource:
             )
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
         externals = tuple(_externals(modules, root))
-        return cls(script, root, modules, externals, found, uses, training)
+        # One that the script makes, if it names any; others may be their bases.
+        called = ({*called_names(nodes), *called_methods(nodes)} for nodes in map(list, map(ast.walk, (training, tree))))
+        named = ([model for model in models if model[0] in names] for names in called)
+        models = next(filter(None, named), models)
+        return cls(script, root, modules, externals, models[0], tuple(models), uses, training)
 
     def place(self, node: ast.AST) -> str:
         """Return the file and line of a node of the script."""
@@ -163,7 +181,7 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
-    def hindrance(self, parameters: Iterable[str]) -> str | None:
+    def hindrance(self, parameters: Collection[str]) -> str | None:
         """Return why no level can be trained; None if the sources do not say.
 
         Args:
@@ -173,9 +191,47 @@ class CheckoutSource:
             return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
         if (several := self.image_scales) is not None:
             return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
-        parameters = [each.arg for each in self.training.args.args]
-        absent_roles = (role for role in NEEDED if self._is_nested(role, parameters))
-        return next((lacks_role(self.training.name, parameters, role) for role in absent_roles), None)
+        arguments = [each.arg for each in self.training.args.args]
+        if role := next((role for role in NEEDED if self._is_nested(role, arguments)), None):
+            return lacks_role(self.training.name, arguments, role)
+        return self._explain_finished_model() or self._explain_frozen_model(parameters)
+
+    def _explain_finished_model(self) -> str | None:
+        """Return how the training function takes Gaussians from elsewhere than a scene's points; None if it does not.
+
+        A script that trains segmentations, features or trees on a finished model is one.
+        """
+        functions = [node for node in self._nodes() if isinstance(node, ast.FunctionDef)]
+        callers = (node for node in functions if node.name != "restore")  # of a checkpoint
+        if not any(SETUP in called_methods(ast.walk(node)) for node in callers):
+            return f"{self.training.name}() ({self.place(self.training)}) trains no {self.model[0]}: it calls no {SETUP}"
+        classes = self.classes
+        for node in (each for each in ast.walk(self.training) if isinstance(each, ast.Call)):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            methods = methods_of(classes[name], classes)[0] if name in classes else {}
+            if "__init__" not in methods or not methods.keys() >= set(SCENE_ROLES):
+                continue
+            made, known = methods["__init__"], constant_arguments(methods["__init__"], node)
+            possible = called_methods(self.branches.possibly(made, known))
+            if known.get(FROM_RUN) or (START in called_methods(ast.walk(made)) and START not in possible):
+                return f"it trains on a finished model: {ast.unparse(node)} ({self.place(node)}) makes none of points"
+        return None
+
+    def _explain_frozen_model(self, parameters: Collection[str]) -> str | None:
+        """Return what the model's optimizer steps by default, if that is none of `parameters`; else None."""
+        setup = methods_of(self.classes[self.model[0]], self.classes)[0].get(SETUP)
+        if setup is None or not parameters or "super" in called_names(ast.walk(setup)):
+            return None
+        groups = [node for node in self.branches.possibly(setup, {}) if isinstance(node, ast.Dict)]
+        values = [v for group in groups for k, v in zip(group.keys, group.values, strict=True) if _is(k, "params")]
+        stepped = {node.attr for value in values for node in ast.walk(value) if isinstance(node, ast.Attribute)}
+        if not stepped or stepped.intersection(parameters):
+            return None
+        return f"it trains on a finished model: its optimizer ({self.model[1]}) steps {', '.join(sorted(stepped))} alone"
+
+    @property
+    def branches(self) -> Branches:
+        return Branches(default_options({name: parsed_quietly(path) for name, path in self.modules.items()}))
 
     def _is_nested(self, role: str, parameters: Collection[str]) -> bool:
         """Return whether only parts of arguments have a role: training reads `cfg.opt.iterations`, no `opt.iterations`.
@@ -304,12 +360,9 @@ def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
     return None
 
 
-def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]) -> tuple[tuple[str, str] | None, str]:
-    """Return the name and place of the Gaussians' class, and the place of one that only resembles it.
-
-    Of several classes it is one that the script calls, `called`: others may be its bases.
-    """
-    near = ""
+def _find_models(modules: Mapping[str, Path], root: Path) -> tuple[list[tuple[str, str]], str]:
+    """Return the names and places of classes of Gaussians, and the place of one that only resembles them."""
+    near, models = "", []
     classes = {
         node.name: (node, path)
         for path in modules.values()
@@ -317,16 +370,20 @@ def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]
         if isinstance(node, ast.ClassDef)
     }
     nodes = {name: node for name, (node, _) in classes.items()}
-    for name, (node, path) in sorted(classes.items(), key=lambda each: each[0] not in called):
+    for name, (node, path) in classes.items():
         methods, whole = methods_of(node, nodes)
         if "training_setup" not in methods:
             continue
         where = place(path, root, node.lineno)
         if whole and (lacks := set(MODEL_ROLES) - methods.keys()):
             near = f"{name} in {where} lacks {', '.join(lacks)}, and no other of its imports"
-            continue
-        return (name, where), ""
-    return None, near
+        else:
+            models.append((name, where))
+    return models, near
+
+
+def _is(key: ast.expr | None, text: str) -> bool:
+    return isinstance(key, ast.Constant) and key.value == text
 
 
 def methods_of(node: ast.ClassDef, classes: Mapping[str, ast.ClassDef]) -> tuple[dict[str, ast.FunctionDef], bool]:

@@ -1,0 +1,113 @@
+"""Follow a checkout's functions along the branches that its options take by default. Executes nothing of it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
+
+from lapgs_plugin.checkouts.syntax import stored_names
+
+OPTIONS = "arguments"
+"""Beginning of the names of modules in which the family's scripts declare their options."""
+
+DECIDABLE = (
+    *(ast.Expression, ast.Name, ast.Attribute, ast.Constant, ast.BoolOp, ast.UnaryOp, ast.Compare),
+    *(ast.boolop, ast.unaryop, ast.cmpop, ast.expr_context),
+)
+"""Nodes of conditions that can be evaluated: they call nothing of the checkout's."""
+
+
+def default_options(trees: Mapping[str, ast.Module]) -> dict[str, Any]:
+    """Return the constants that options are by default, by name; options with several are left out.
+
+    Args:
+        trees: syntax trees of a checkout by module name; the script is `__main__`.
+    """
+    values: dict[str, list[Any]] = {}
+    for module, tree in trees.items():
+        if not module.startswith((OPTIONS, "__main__")):
+            continue
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
+                words = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
+                flag = {"store_true": False, "store_false": True}.get(str(words.get("action")))
+                names = [str(each.value) for each in node.args if isinstance(each, ast.Constant)]
+                name, default = names[-1].strip("-").replace("-", "_") if names else "", words.get("default", flag)
+            elif isinstance(node, ast.Assign) and module != "__main__" and isinstance(node.value, ast.Constant):
+                name, default = getattr(node.targets[0], "attr", "").removeprefix("_"), node.value.value
+            else:
+                continue
+            values.setdefault(name, []).append(default)
+    return {name: constants[0] for name, constants in values.items() if len(constants) == 1}
+
+
+class Branches:
+    """Yield what functions execute.
+
+    Args:
+        options: values of options by name, which are read as attributes.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self._options = SimpleNamespace(**options)
+
+    def surely(self, function: ast.FunctionDef, passed: Mapping[str, Any]) -> Iterator[ast.AST]:
+        """Yield nodes that are executed however undecided branches go; loops are taken to run.
+
+        Args:
+            function: the function.
+            passed: its arguments that are known constants, by parameter name.
+        """
+        return self._executed(function.body, passed, both=False)
+
+    def possibly(self, function: ast.FunctionDef, passed: Mapping[str, Any]) -> Iterator[ast.AST]:
+        """Yield nodes that are executed by some way of undecided branches; arguments as of `surely`."""
+        return self._executed(function.body, passed, both=True)
+
+    def _executed(self, body: Iterable[ast.AST], variables: Mapping[str, Any], both: bool) -> Iterator[ast.AST]:
+        waiting = [*body]
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, (ast.FunctionDef, ast.Lambda)) or (isinstance(node, ast.Try) and not both):
+                continue
+            yield node
+            if not isinstance(node, (ast.If, ast.IfExp)):
+                waiting += ast.iter_child_nodes(node)
+                continue
+            holds = self._decide(node.test, variables)
+            waiting.append(node.test)
+            for branch, wanted in ((node.body, True), (node.orelse, False)):
+                if holds is wanted or (holds is None and both):
+                    waiting += branch if isinstance(branch, list) else [branch]
+
+    def _decide(self, condition: ast.expr, variables: Mapping[str, Any]) -> bool | None:
+        """Return whether a condition holds, None if that hangs on more than options and known variables."""
+        nodes = list(ast.walk(condition))
+        if not all(isinstance(node, DECIDABLE) for node in nodes):
+            return None
+        holders = {node.value.id for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)}
+        names = {**dict.fromkeys(holders - {"self"}, self._options), **variables, "__builtins__": {}}
+        with suppress(Exception):  # a name or an attribute that is none of these
+            return bool(eval(compile(ast.Expression(condition), "", "eval"), names))
+        return None
+
+
+def constant_arguments(function: ast.FunctionDef, call: ast.Call | None) -> dict[str, Any]:
+    """Return the arguments of a call that are constants, by parameter, with the defaults of those that it leaves out."""
+    parameters = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
+    defaults = function.args.defaults
+    values = dict(zip(parameters[len(parameters) - len(defaults) :], defaults, strict=True))
+    if call is not None:
+        first = parameters[1:] if parameters[:1] == ["self"] else parameters
+        values |= dict(zip(first, call.args, strict=False))
+        values |= {word.arg: word.value for word in call.keywords if word.arg is not None}
+        if any(word.arg is None for word in call.keywords) or any(isinstance(each, ast.Starred) for each in call.args):
+            return {}
+    constants = {}
+    for name, value in values.items():
+        with suppress(ValueError):  # it is no constant
+            constants[name] = ast.literal_eval(value)
+    return {name: value for name, value in constants.items() if name not in stored_names(function)}
