@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
@@ -45,7 +45,7 @@ def default_options(trees: Mapping[str, ast.Module]) -> dict[str, Any]:
 
 
 class Branches:
-    """Yield what functions execute.
+    """Follow functions with the values of options.
 
     Args:
         options: values of options by name, which are read as attributes.
@@ -54,33 +54,27 @@ class Branches:
     def __init__(self, options: Mapping[str, Any]) -> None:
         self._options = SimpleNamespace(**options)
 
-    def surely(self, function: ast.FunctionDef, passed: Mapping[str, Any]) -> Iterator[ast.AST]:
-        """Yield nodes that are executed however undecided branches go; loops are taken to run.
+    def executed(self, function: ast.FunctionDef, passed: Mapping[str, Any], *, surely: bool) -> Iterator[ast.AST]:
+        """Yield nodes that a function executes; loops are taken to run.
 
         Args:
             function: the function.
             passed: its arguments that are known constants, by parameter name.
+            surely: whether undecided branches, and `try`, are left out; else each way of them is followed.
         """
-        return self._executed(function.body, passed, both=False)
-
-    def possibly(self, function: ast.FunctionDef, passed: Mapping[str, Any]) -> Iterator[ast.AST]:
-        """Yield nodes that are executed by some way of undecided branches; arguments as of `surely`."""
-        return self._executed(function.body, passed, both=True)
-
-    def _executed(self, body: Iterable[ast.AST], variables: Mapping[str, Any], both: bool) -> Iterator[ast.AST]:
-        waiting = [*body]
+        waiting: list[ast.AST] = [*function.body]
         while waiting:
             node = waiting.pop()
-            if isinstance(node, (ast.FunctionDef, ast.Lambda)) or (isinstance(node, ast.Try) and not both):
+            if isinstance(node, (ast.FunctionDef, ast.Lambda)) or (isinstance(node, ast.Try) and surely):
                 continue
             yield node
             if not isinstance(node, (ast.If, ast.IfExp)):
                 waiting += ast.iter_child_nodes(node)
                 continue
-            holds = self._decide(node.test, variables)
             waiting.append(node.test)
+            holds = self._decide(node.test, passed)
             for branch, wanted in ((node.body, True), (node.orelse, False)):
-                if holds is wanted or (holds is None and both):
+                if holds is wanted or (holds is None and not surely):
                     waiting += branch if isinstance(branch, list) else [branch]
 
     def _decide(self, condition: ast.expr, variables: Mapping[str, Any]) -> bool | None:
@@ -88,7 +82,9 @@ class Branches:
         nodes = list(ast.walk(condition))
         if not all(isinstance(node, DECIDABLE) for node in nodes):
             return None
-        holders = {node.value.id for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)}
+        holders = {
+            node.value.id for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+        }
         names = {**dict.fromkeys(holders - {"self"}, self._options), **variables, "__builtins__": {}}
         with suppress(Exception):  # a name or an attribute that is none of these
             return bool(eval(compile(ast.Expression(condition), "", "eval"), names))
@@ -96,7 +92,7 @@ class Branches:
 
 
 def constant_arguments(function: ast.FunctionDef, call: ast.Call | None) -> dict[str, Any]:
-    """Return the arguments of a call that are constants, by parameter, with the defaults of those that it leaves out."""
+    """Return the arguments of a call that are constants by parameter, defaults included."""
     parameters = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
     defaults = function.args.defaults
     values = dict(zip(parameters[len(parameters) - len(defaults) :], defaults, strict=True))

@@ -7,35 +7,38 @@ from collections.abc import Collection, Iterable, Mapping
 
 from lapgs_plugin.checkouts.conditions import constant_arguments
 from lapgs_plugin.checkouts.source import START, CheckoutSource, methods_of
-from lapgs_plugin.checkouts.syntax import called_names, parsed_quietly
+from lapgs_plugin.checkouts.syntax import called_name, called_names, parsed_quietly
 
 OF_ANY_FIELD = {"active_sh_degree", "max_radii2D"}
 """Attributes that a model made from a field has, too."""
 
 
-def explain_values_beside(source: CheckoutSource, parameters: Collection[str]) -> str | None:
+def explain_values_beside(source: CheckoutSource, parameters: Collection[str], *, surely: bool = True) -> str | None:
     """Return why a model made from a finished field cannot be rendered; None if the sources do not say.
 
     Args:
         source: the checkout.
         parameters: attributes of the model that are made from a field.
+        surely: whether branches that default options do not decide are left out.
     """
     classes = source.classes
     methods, _ = methods_of(classes[source.model[0]], classes)
     if START not in methods:
         return None
-    made = _attributes(source.branches.surely(methods[START], {}), ast.Store)
-    beside = sorted(made.intersection(_rendered(source, methods)).difference(parameters, OF_ANY_FIELD))
-    if not beside:
-        return None
-    names = ", ".join(beside)
-    return f"its Gaussians ({source.model[1]}) are rendered with {names}, which {START}() makes and fields do not have"
+    made = _attributes(source.branches.executed(methods[START], {}, surely=surely), ast.Store)
+    beside = sorted(made.intersection(_rendered(source, methods, surely)).difference(parameters, OF_ANY_FIELD))
+    return values_beside(source.model[1], beside) if beside else None
 
 
-def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef]) -> set[str]:
+def values_beside(place: str, names: Iterable[str]) -> str:
+    """Return a clause that says which attributes of a model at a place in a checkout fields do not have."""
+    return f"its Gaussians ({place}) are rendered with {', '.join(names)}, which {START}() makes and fields do not have"
+
+
+def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef], surely: bool) -> set[str]:
     """Return names of attributes that the loop's renderers read by default, also through model methods."""
     branches = source.branches
-    calls = {getattr(node.func, "id", ""): node for node in ast.walk(source.training) if isinstance(node, ast.Call)}
+    calls = {called_name(node): node for node in ast.walk(source.training) if isinstance(node, ast.Call)}
     functions, waiting = dict(methods), list[str]()
     for use in source.rasterizers:
         holder = ast.walk(parsed_quietly(source.modules[use.holder]))
@@ -48,7 +51,7 @@ def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef]) ->
             continue
         seen.add(name)
         known = constant_arguments(functions[name], calls[name]) if name in calls else {}
-        nodes = list(branches.surely(functions[name], known))
+        nodes = list(branches.executed(functions[name], known, surely=surely))
         found = _attributes(nodes, ast.Load)
         read |= found
         waiting += [*found, *called_names(nodes)]

@@ -15,11 +15,13 @@ from lapgs_plugin.checkouts.conditions import Branches, constant_arguments, defa
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import (
     called_methods,
+    called_name,
     called_names,
     executed_on_import,
     parsed,
     parsed_quietly,
     place,
+    stored_names,
 )
 from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
@@ -152,7 +154,9 @@ class CheckoutSource:
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
         externals = tuple(_externals(modules, root))
         # One that the script makes, if it names any; others may be their bases.
-        called = ({*called_names(nodes), *called_methods(nodes)} for nodes in map(list, map(ast.walk, (training, tree))))
+        called = (
+            {*called_names(nodes), *called_methods(nodes)} for nodes in map(list, map(ast.walk, (training, tree)))
+        )
         named = ([model for model in models if model[0] in names] for names in called)
         models = next(filter(None, named), models)
         return cls(script, root, modules, externals, models[0], tuple(models), uses, training)
@@ -160,6 +164,30 @@ class CheckoutSource:
     def place(self, node: ast.AST) -> str:
         """Return the file and line of a node of the script."""
         return f"{self.script.relative_to(self.root)}:{getattr(node, 'lineno', 0)}"
+
+    @property
+    def model_variable(self) -> str:
+        """Name of the training function's variable for the model."""
+        set_up, made, models = list[str](), list[str](), dict(self.models)
+        for node in sorted(ast.walk(self.training), key=lambda node: getattr(node, "lineno", 0)):
+            if isinstance(node, ast.Attribute) and node.attr == SETUP and isinstance(node.value, ast.Name):
+                set_up.append(node.value.id)
+            elif (
+                isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and called_name(node.value) in models
+            ):
+                made += [target.id for target in node.targets if isinstance(target, ast.Name)]
+        return next((name for name in set_up if name in made), next(iter((*made, *set_up)), "gaussians"))
+
+    @property
+    def model_statements(self) -> list[ast.stmt]:
+        """Statements of the training function that make the model before it is set up, and what they need."""
+        body, names, kept = self.training.body, {self.model_variable}, list[ast.stmt]()
+        ends = (i for i, node in enumerate(body) if SETUP in called_methods(ast.walk(node)))
+        for node in reversed(body[: next(ends, 0)]):
+            if names & stored_names(node):
+                kept.insert(0, node)
+                names |= {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+        return kept
 
     @property
     def scale_axes(self) -> tuple[int, str] | None:
@@ -204,17 +232,19 @@ class CheckoutSource:
         functions = [node for node in self._nodes() if isinstance(node, ast.FunctionDef)]
         callers = (node for node in functions if node.name != "restore")  # of a checkpoint
         if not any(SETUP in called_methods(ast.walk(node)) for node in callers):
-            return f"{self.training.name}() ({self.place(self.training)}) trains no {self.model[0]}: it calls no {SETUP}"
+            return (
+                f"{self.training.name}() ({self.place(self.training)}) trains no {self.model[0]}: it calls no {SETUP}"
+            )
         classes = self.classes
         for node in (each for each in ast.walk(self.training) if isinstance(each, ast.Call)):
-            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            name = called_name(node)
             methods = methods_of(classes[name], classes)[0] if name in classes else {}
             if "__init__" not in methods or not methods.keys() >= set(SCENE_ROLES):
                 continue
             made, known = methods["__init__"], constant_arguments(methods["__init__"], node)
-            possible = called_methods(self.branches.possibly(made, known))
+            possible = called_methods(self.branches.executed(made, known, surely=False))
             if known.get(FROM_RUN) or (START in called_methods(ast.walk(made)) and START not in possible):
-                return f"it trains on a finished model: {ast.unparse(node)} ({self.place(node)}) makes none of points"
+                return f"it trains on a finished model: {self.place(node)}: {ast.unparse(node)} makes none of points"
         return None
 
     def _explain_frozen_model(self, parameters: Collection[str]) -> str | None:
@@ -222,15 +252,19 @@ class CheckoutSource:
         setup = methods_of(self.classes[self.model[0]], self.classes)[0].get(SETUP)
         if setup is None or not parameters or "super" in called_names(ast.walk(setup)):
             return None
-        groups = [node for node in self.branches.possibly(setup, {}) if isinstance(node, ast.Dict)]
+        nodes = self.branches.executed(setup, {}, surely=False)
+        groups = [node for node in nodes if isinstance(node, ast.Dict)]
         values = [v for group in groups for k, v in zip(group.keys, group.values, strict=True) if _is(k, "params")]
         stepped = {node.attr for value in values for node in ast.walk(value) if isinstance(node, ast.Attribute)}
         if not stepped or stepped.intersection(parameters):
             return None
-        return f"it trains on a finished model: its optimizer ({self.model[1]}) steps {', '.join(sorted(stepped))} alone"
+        return (
+            f"it trains on a finished model: its optimizer ({self.model[1]}) steps {', '.join(sorted(stepped))} alone"
+        )
 
     @property
     def branches(self) -> Branches:
+        """What its functions execute by default."""
         return Branches(default_options({name: parsed_quietly(path) for name, path in self.modules.items()}))
 
     def _is_nested(self, role: str, parameters: Collection[str]) -> bool:
