@@ -9,9 +9,11 @@ import ast
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from lapgs_plugin.checkouts.conditions import Branches, constant_arguments, default_options
+from lapgs_plugin.checkouts.other_trainers import advice_for
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import (
     called_methods,
@@ -62,7 +64,7 @@ class External:
         name: full name of the module.
         names: names that are imported from it.
         where: file and line of its import.
-        optional: whether the import may fail: in a `try`, or in a function that may never be called.
+        optional: whether the import may fail or be left out: in a `try`, in a branch, or in a function.
     """
 
     name: str
@@ -144,15 +146,16 @@ class CheckoutSource:
         else:
             raise UserInputError(
                 f"{given} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
-                f"with {' and '.join(MODEL_ROLES)}; {OTHERWISE}"
+                f"with {' and '.join(MODEL_ROLES)}; {advice_for(_packages(tree, script))}"
             )
         if training is None:
             raise UserInputError(
                 f"{given} has no function that its main block calls and that calls backward(), expected a function "
-                f"like training(dataset, opt, pipe, ...); {OTHERWISE}"
+                f"like training(dataset, opt, pipe, ...); {advice_for(_packages(tree, script))}"
             )
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
-        externals = tuple(_externals(modules, root))
+        needed = {name for name, _ in _reachable(script, (script.parent, root), surely=True)}
+        externals = tuple(_externals(modules, root, needed))
         # One that the script makes, if it names any; others may be their bases.
         called = (
             {*called_names(nodes), *called_methods(nodes)} for nodes in map(list, map(ast.walk, (training, tree)))
@@ -222,19 +225,18 @@ class CheckoutSource:
         arguments = [each.arg for each in self.training.args.args]
         if role := next((role for role in NEEDED if self._is_nested(role, arguments)), None):
             return lacks_role(self.training.name, arguments, role)
-        return self._explain_finished_model() or self._explain_frozen_model(parameters)
+        return self.of_finished_model or self._explain_frozen_model(parameters)
 
-    def _explain_finished_model(self) -> str | None:
-        """Return how the training function takes Gaussians from elsewhere than a scene's points; None if it does not.
+    @cached_property
+    def of_finished_model(self) -> str | None:
+        """How the training function takes Gaussians from elsewhere than a scene's points; None if it does not.
 
         A script that trains segmentations, features or trees on a finished model is one.
         """
         functions = [node for node in self._nodes() if isinstance(node, ast.FunctionDef)]
         callers = (node for node in functions if node.name != "restore")  # of a checkpoint
         if not any(SETUP in called_methods(ast.walk(node)) for node in callers):
-            return (
-                f"{self.training.name}() ({self.place(self.training)}) trains no {self.model[0]}: it calls no {SETUP}"
-            )
+            return f"it trains something else than {self.model[0]}: {self.place(self.training)} calls no {SETUP}"
         classes = self.classes
         for node in (each for each in ast.walk(self.training) if isinstance(each, ast.Call)):
             name = called_name(node)
@@ -258,11 +260,10 @@ class CheckoutSource:
         stepped = {node.attr for value in values for node in ast.walk(value) if isinstance(node, ast.Attribute)}
         if not stepped or stepped.intersection(parameters):
             return None
-        return (
-            f"it trains on a finished model: its optimizer ({self.model[1]}) steps {', '.join(sorted(stepped))} alone"
-        )
+        names = ", ".join(sorted(stepped))
+        return f"it trains on a finished model: by default its optimizer ({self.model[1]}) steps {names} alone"
 
-    @property
+    @cached_property
     def branches(self) -> Branches:
         """What its functions execute by default."""
         return Branches(default_options({name: parsed_quietly(path) for name, path in self.modules.items()}))
@@ -287,7 +288,7 @@ class CheckoutSource:
         known = self.attributes
         return [name for name in names if name not in known]
 
-    @property
+    @cached_property
     def classes(self) -> dict[str, ast.ClassDef]:
         """Classes of its modules by name."""
         trees = [parsed_quietly(path) for path in self.modules.values()]
@@ -342,25 +343,37 @@ def training_scripts(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
 
 
-def readable_source(folder: Path) -> CheckoutSource | None:
-    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+def readable_sources(folder: Path) -> tuple[list[CheckoutSource], list[UserInputError]]:
+    """Return the sources of a folder's training scripts that are ones of 3DGS, and why others are not.
+
+    Those that train on a finished model come last.
+    """
+    sources, problems = list[CheckoutSource](), list[UserInputError]()
     for script in training_scripts(folder):
         try:
-            source = CheckoutSource.read(script)
-        except UserInputError:
-            continue
-        if source.root == folder.absolute():
-            return source
-    return None
+            sources.append(CheckoutSource.read(script))
+        except UserInputError as error:
+            problems.append(error)
+    return sorted(sources, key=lambda source: source.of_finished_model is not None), problems
 
 
-def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
-    """Yield the checkout's modules that a script imports, the script itself first, with their files."""
+def readable_source(folder: Path) -> CheckoutSource | None:
+    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+    sources, _ = readable_sources(folder)
+    return next((source for source in sources if source.root == folder.absolute()), None)
+
+
+def _reachable(script: Path, folders: tuple[Path, ...], *, surely: bool = False) -> Iterator[tuple[str, Path]]:
+    """Yield the checkout's modules that a script imports, the script itself first, with their files.
+
+    With `surely`, those that it imports whichever way branches go.
+    """
     waiting, seen = [("__main__", script)], {"__main__"}
     while waiting:
         name, path = waiting.pop(0)
         yield name, path
-        for node in ast.walk(parsed_quietly(path)):
+        tree = parsed_quietly(path)
+        for node in executed_on_import(tree.body, surely=True) if surely else ast.walk(tree):
             for imported in _imported(node, name, path):
                 file = _file_of(imported, folders)
                 if file is not None and imported not in seen:
@@ -383,6 +396,11 @@ def _imported(node: ast.AST, module: str, path: Path) -> Iterator[str]:
     for name in names:
         parts = name.split(".")
         yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
+
+
+def _packages(tree: ast.Module, script: Path) -> set[str]:
+    """Return the names of packages that a script imports."""
+    return {name.partition(".")[0] for node in ast.walk(tree) for name in _imported(node, "__main__", script)}
 
 
 def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
@@ -444,11 +462,11 @@ def _find_training(tree: ast.Module) -> ast.FunctionDef | None:
     return next((each for each in found if "backward" in called_methods(ast.walk(each))), None)
 
 
-def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
-    """Yield imports of modules that are not in the checkout."""
-    for path in modules.values():
+def _externals(modules: Mapping[str, Path], root: Path, needed: Collection[str]) -> Iterator[External]:
+    """Yield imports of modules that are not in the checkout; its own modules `needed` are imported for sure."""
+    for module, path in modules.items():
         tree = parsed_quietly(path)
-        needed = {id(node) for node in executed_on_import(tree.body, surely=True)}
+        sure = {id(node) for node in executed_on_import(tree.body, surely=True)} if module in needed else set()
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 imports: dict[str, tuple[str, ...]] = {alias.name: () for alias in node.names}
@@ -460,4 +478,4 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
             for each, names in imports.items():
                 own = each.partition(".")[0] in modules or any(name.startswith(f"{each}.") for name in modules)
                 if each not in modules and not own:
-                    yield External(each, names, where, id(node) not in needed)
+                    yield External(each, names, where, id(node) not in sure)

@@ -37,7 +37,7 @@ def parsed_quietly(path: Path) -> ast.Module:
 
 def executed_on_import(body: Iterable[ast.AST], *, surely: bool = False) -> Iterator[ast.AST]:
     """Yield statements that importing a module may execute; with `surely` those that it does, whatever fails."""
-    excused = (ast.Try, ast.With) if surely else ()  # `with suppress(ImportError)`
+    excused = (ast.Try, ast.With, ast.If) if surely else ()  # `with suppress(ImportError)`
     for node in body:
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, *excused)):
             yield node

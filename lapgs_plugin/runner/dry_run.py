@@ -126,7 +126,8 @@ class DryRun:
                 "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_MAY_WORK
             ),
         ):
-            gaussians = self._new_model()
+            with self._step("a model of the scene's points", "one as without lapgs", OFF):
+                gaussians = self._new_model()
             self._require_parameters(gaussians)
             self._require_settable(gaussians)
             self._require_three_axes(gaussians)

@@ -1,0 +1,72 @@
+"""Find packages that a checkout cannot do without and that are not installed. Executes nothing, imports no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from lapgs_plugin.checkouts.source import CheckoutSource, OwnPackage
+from lapgs_plugin.environment import is_installed
+
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "mpl_toolkits": "matplotlib",
+    "PIL": "pillow",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
+"""Distributions whose names differ from those of their packages."""
+
+README = "install it as the checkout's README says"
+
+
+@dataclass(frozen=True)
+class MissingPackage:
+    """Name a package that is not installed.
+
+    Attributes:
+        name: of the package.
+        where: file and line of its first import.
+        own: the folder of the checkout that it is installed from, if there is one.
+        extension: whether it is a compiled part of the family, of which a package index may hold a stranger's.
+    """
+
+    name: str
+    where: str
+    own: OwnPackage | None
+    extension: bool
+
+    @property
+    def install(self) -> str:
+        """How to install it."""
+        if self.own is not None:
+            return self.own.install
+        return README if self.extension else f"pip install {DISTRIBUTIONS.get(self.name, self.name)}"
+
+
+def missing_packages(source: CheckoutSource, extensions: Iterable[str]) -> list[MissingPackage]:
+    """Return the packages that importing a checkout's script needs and that cannot be found, by name.
+
+    Args:
+        source: the checkout.
+        extensions: compiled modules of the family.
+    """
+    compiled = {package_of(module) for module in (*extensions, *source.rasterizer_modules)}
+    needed = {package_of(one.name): one.where for one in reversed(source.externals) if not one.optional}
+    absent = [name for name in sorted(needed) if not is_installed(name)]
+    return [MissingPackage(name, needed[name], source.own_package(name), name in compiled) for name in absent]
+
+
+def how_to_install(missing: Collection[MissingPackage]) -> str:
+    """Return one clause on how to install packages, those of the package index in one command."""
+    foreign = [DISTRIBUTIONS.get(one.name, one.name) for one in missing if one.own is None and not one.extension]
+    commands = [f"pip install {' '.join(dict.fromkeys(foreign))}"] if foreign else []
+    commands += [one.own.install for one in missing if one.own is not None]
+    readme = [one.name for one in missing if one.own is None and one.extension]
+    return "; ".join([*commands, *([f"{', '.join(readme)}: as the checkout's README says"] if readme else [])])
+
+
+def package_of(module: str) -> str:
+    """Return the package that a module is in."""
+    return module.partition(".")[0]
