@@ -111,6 +111,10 @@ def _dump(value: object, path: str) -> None:
     Path(path).write_bytes(pickle.dumps(value))
 
 
+def _nothing(*_: object, **__: object) -> None:
+    """Do nothing, as choosing a backend that draws nothing."""
+
+
 class NoLog:
     """Take the place of TensorBoard's SummaryWriter, and write nothing."""
 
@@ -140,7 +144,7 @@ _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
     # Mip-Splatting imports it without using it.
     "open3d": ("open3d", {"open3d": {}}),
     # 2DGS draws curves and depths with it.
-    "matplotlib": ("matplotlib", {"matplotlib": {}, "matplotlib.pyplot": {}, "matplotlib.cm": {}}),
+    "matplotlib": ("matplotlib", {"matplotlib": {"use": _nothing}, "matplotlib.pyplot": {}, "matplotlib.cm": {}}),
     # EfficientGS reads scenes that it has packed, and logs; its logs are left out.
     "joblib": ("joblib", {"joblib": {"dump": _dump}}),
     "h5py": ("h5py", {"h5py": {}}),

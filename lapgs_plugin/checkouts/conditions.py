@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
-from lapgs_plugin.checkouts.syntax import stored_names
+from lapgs_plugin.checkouts.syntax import called_name, stored_names
 
-OPTIONS = "arguments"
-"""Beginning of the names of modules in which the family's scripts declare their options."""
+PARSER = "parser"
+"""Parameter of functions in which the family's scripts declare their options."""
 
 DECIDABLE = (
     *(ast.Expression, ast.Name, ast.Attribute, ast.Constant, ast.BoolOp, ast.UnaryOp, ast.Compare),
@@ -20,27 +20,27 @@ DECIDABLE = (
 """Nodes of conditions that can be evaluated: they call nothing of the checkout's."""
 
 
-def default_options(trees: Mapping[str, ast.Module]) -> dict[str, Any]:
+def default_options(trees: Iterable[ast.Module]) -> dict[str, Any]:
     """Return the constants that options are by default, by name; options with several are left out.
 
     Args:
-        trees: syntax trees of a checkout by module name; the script is `__main__`.
+        trees: syntax trees of a checkout, the script's first.
     """
+    script, *modules = trees
+    functions = [node for tree in (script, *modules) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    declaring = [node for node in functions if any(each.arg == PARSER for each in node.args.args)]
     values: dict[str, list[Any]] = {}
-    for module, tree in trees.items():
-        if not module.startswith((OPTIONS, "__main__")):
+    for node in (*ast.walk(script), *(node for function in declaring for node in ast.walk(function))):
+        if isinstance(node, ast.Call) and called_name(node) == "add_argument":
+            words = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
+            flag = {"store_true": False, "store_false": True}.get(str(words.get("action")))
+            names = [str(each.value) for each in node.args if isinstance(each, ast.Constant)]
+            name, default = names[-1].strip("-").replace("-", "_") if names else "", words.get("default", flag)
+        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+            name, default = getattr(node.targets[0], "attr", "").removeprefix("_"), node.value.value
+        else:
             continue
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
-                words = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
-                flag = {"store_true": False, "store_false": True}.get(str(words.get("action")))
-                names = [str(each.value) for each in node.args if isinstance(each, ast.Constant)]
-                name, default = names[-1].strip("-").replace("-", "_") if names else "", words.get("default", flag)
-            elif isinstance(node, ast.Assign) and module != "__main__" and isinstance(node.value, ast.Constant):
-                name, default = getattr(node.targets[0], "attr", "").removeprefix("_"), node.value.value
-            else:
-                continue
-            values.setdefault(name, []).append(default)
+        values.setdefault(name, []).append(default)
     return {name: constants[0] for name, constants in values.items() if len(constants) == 1}
 
 
@@ -77,33 +77,41 @@ class Branches:
                 if holds is wanted or (holds is None and not surely):
                     waiting += branch if isinstance(branch, list) else [branch]
 
-    def _decide(self, condition: ast.expr, variables: Mapping[str, Any]) -> bool | None:
-        """Return whether a condition holds, None if that hangs on more than options and known variables."""
-        nodes = list(ast.walk(condition))
-        if not all(isinstance(node, DECIDABLE) for node in nodes):
-            return None
-        holders = {
-            node.value.id for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
-        }
-        names = {**dict.fromkeys(holders - {"self"}, self._options), **variables, "__builtins__": {}}
-        with suppress(Exception):  # a name or an attribute that is none of these
-            return bool(eval(compile(ast.Expression(condition), "", "eval"), names))
-        return None
-
-
-def constant_arguments(function: ast.FunctionDef, call: ast.Call | None) -> dict[str, Any]:
-    """Return the arguments of a call that are constants by parameter, defaults included."""
-    parameters = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
-    defaults = function.args.defaults
-    values = dict(zip(parameters[len(parameters) - len(defaults) :], defaults, strict=True))
-    if call is not None:
-        first = parameters[1:] if parameters[:1] == ["self"] else parameters
-        values |= dict(zip(first, call.args, strict=False))
+    def arguments(self, function: ast.FunctionDef, call: ast.Call) -> dict[str, Any]:
+        """Return the arguments of a call that are constants or options by parameter, defaults included."""
+        parameters = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
+        defaults = function.args.defaults
+        values = dict(zip(parameters[len(parameters) - len(defaults) :], defaults, strict=True))
+        given = parameters[1:] if parameters[:1] == ["self"] else parameters
+        values |= dict(zip(given, call.args, strict=False))
         values |= {word.arg: word.value for word in call.keywords if word.arg is not None}
         if any(word.arg is None for word in call.keywords) or any(isinstance(each, ast.Starred) for each in call.args):
             return {}
-    constants = {}
-    for name, value in values.items():
-        with suppress(ValueError):  # it is no constant
-            constants[name] = ast.literal_eval(value)
-    return {name: value for name, value in constants.items() if name not in stored_names(function)}
+        changed, known = stored_names(function), {}
+        for name, value in values.items():
+            with suppress(ValueError):  # it is neither
+                known[name] = self._evaluated(value, {})
+        return {name: value for name, value in known.items() if name not in changed}
+
+    def _decide(self, condition: ast.expr, variables: Mapping[str, Any]) -> bool | None:
+        """Return whether a condition holds, None if that hangs on more than options and known variables."""
+        with suppress(ValueError):
+            return bool(self._evaluated(condition, variables))
+        return None
+
+    def _evaluated(self, expression: ast.expr, variables: Mapping[str, Any]) -> Any:
+        """Return the value of an expression of constants, options and known variables.
+
+        Raises:
+            ValueError: it hangs on more.
+        """
+        nodes = list(ast.walk(expression))
+        if not all(isinstance(node, DECIDABLE) for node in nodes):
+            raise ValueError("it does more than compare")
+        holders = (node.value for node in nodes if isinstance(node, ast.Attribute))
+        namespaces = {each.id for each in holders if isinstance(each, ast.Name)} - {"self"}
+        names = {**dict.fromkeys(namespaces, self._options), **variables, "__builtins__": {}}
+        try:
+            return eval(compile(ast.Expression(expression), "", "eval"), names)
+        except Exception as error:
+            raise ValueError("it has a name or an attribute that is none of these") from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Collection, Iterable, Mapping
 
-from lapgs_plugin.checkouts.conditions import constant_arguments
 from lapgs_plugin.checkouts.source import START, CheckoutSource, methods_of
 from lapgs_plugin.checkouts.syntax import called_name, called_names, parsed_quietly
 
@@ -50,7 +49,7 @@ def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef], su
         if name in seen or name not in functions:
             continue
         seen.add(name)
-        known = constant_arguments(functions[name], calls[name]) if name in calls else {}
+        known = branches.arguments(functions[name], calls[name]) if name in calls else {}
         nodes = list(branches.executed(functions[name], known, surely=surely))
         found = _attributes(nodes, ast.Load)
         read |= found

@@ -11,8 +11,8 @@ PREFIXES = {"ns-": "nerfstudio"}
 
 KNOWN = {
     "nerfstudio": "nerfstudio's trainers have models of their own; `lapgs train DATA` trains the folder that they read",
-    "gsplat": "scripts around gsplat have loops of their own; `lapgs train SCENE` trains with gsplat, without a checkout, and "
-    "`lapgs help python` shows how a loop of your own trains levels",
+    "gsplat": "scripts around gsplat have loops of their own; `lapgs train SCENE` trains with gsplat without a "
+    "checkout, and `lapgs help python` shows how a loop of your own trains levels",
 }
 """What to do by the package that a script imports."""
 

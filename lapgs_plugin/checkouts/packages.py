@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from lapgs_plugin.checkouts.source import CheckoutSource, OwnPackage
@@ -18,6 +18,7 @@ DISTRIBUTIONS = {
 }
 """Distributions whose names differ from those of their packages."""
 
+INDEX = "pip install "
 README = "install it as the checkout's README says"
 
 
@@ -38,11 +39,16 @@ class MissingPackage:
     extension: bool
 
     @property
+    def distribution(self) -> str:
+        """Its name in the package index, if it is there; empty for parts of checkouts."""
+        return "" if self.extension or self.own is not None else DISTRIBUTIONS.get(self.name, self.name)
+
+    @property
     def install(self) -> str:
         """How to install it."""
         if self.own is not None:
             return self.own.install
-        return README if self.extension else f"pip install {DISTRIBUTIONS.get(self.name, self.name)}"
+        return f"{INDEX}{self.distribution}" if self.distribution else README
 
 
 def missing_packages(source: CheckoutSource, extensions: Iterable[str]) -> list[MissingPackage]:
@@ -58,13 +64,15 @@ def missing_packages(source: CheckoutSource, extensions: Iterable[str]) -> list[
     return [MissingPackage(name, needed[name], source.own_package(name), name in compiled) for name in absent]
 
 
-def how_to_install(missing: Collection[MissingPackage]) -> str:
-    """Return one clause on how to install packages, those of the package index in one command."""
-    foreign = [DISTRIBUTIONS.get(one.name, one.name) for one in missing if one.own is None and not one.extension]
-    commands = [f"pip install {' '.join(dict.fromkeys(foreign))}"] if foreign else []
-    commands += [one.own.install for one in missing if one.own is not None]
-    readme = [one.name for one in missing if one.own is None and one.extension]
-    return "; ".join([*commands, *([f"{', '.join(readme)}: as the checkout's README says"] if readme else [])])
+def how_to_install(missing: Iterable[MissingPackage]) -> str:
+    """Return how to install packages, those of the package index in one command."""
+    alike: dict[str, list[MissingPackage]] = {}
+    for one in missing:
+        alike.setdefault(INDEX if one.distribution else one.install, []).append(one)
+    return "; ".join(
+        f"{', '.join(one.name for one in several)}: {how}{' '.join(dict.fromkeys(one.distribution for one in several))}"
+        for how, several in alike.items()
+    )
 
 
 def package_of(module: str) -> str:

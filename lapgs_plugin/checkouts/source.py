@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from lapgs_plugin.checkouts.conditions import Branches, constant_arguments, default_options
+from lapgs_plugin.checkouts.conditions import Branches, default_options
 from lapgs_plugin.checkouts.other_trainers import advice_for
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import (
@@ -243,7 +243,7 @@ class CheckoutSource:
             methods = methods_of(classes[name], classes)[0] if name in classes else {}
             if "__init__" not in methods or not methods.keys() >= set(SCENE_ROLES):
                 continue
-            made, known = methods["__init__"], constant_arguments(methods["__init__"], node)
+            made, known = methods["__init__"], self.branches.arguments(methods["__init__"], node)
             possible = called_methods(self.branches.executed(made, known, surely=False))
             if known.get(FROM_RUN) or (START in called_methods(ast.walk(made)) and START not in possible):
                 return f"it trains on a finished model: {self.place(node)}: {ast.unparse(node)} makes none of points"
@@ -266,7 +266,7 @@ class CheckoutSource:
     @cached_property
     def branches(self) -> Branches:
         """What its functions execute by default."""
-        return Branches(default_options({name: parsed_quietly(path) for name, path in self.modules.items()}))
+        return Branches(default_options(map(parsed_quietly, self.modules.values())))
 
     def _is_nested(self, role: str, parameters: Collection[str]) -> bool:
         """Return whether only parts of arguments have a role: training reads `cfg.opt.iterations`, no `opt.iterations`.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.checkouts.source import OTHERWISE, START
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.runner.object_values import with_values
@@ -76,3 +77,11 @@ class _PointRecorder:
 
     def create_from_pcd(self, points: Any, *others: Any) -> None:
         self.points, self.others = points, others
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith(("load", "create", "restore")):
+            raise UserInputError(
+                f"the checkout's Scene makes its model by {name}(), expected {START}() of a scene's points: it trains "
+                f"on a finished model; {OTHERWISE}"
+            )
+        raise AttributeError(f"the model of a scene has no {name} before it is made of points")

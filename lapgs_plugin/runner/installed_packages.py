@@ -88,7 +88,7 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
     missing = MissingPackage(package, where or str(script), own, extension or purpose is not None)
     named = f", the {purpose}" if purpose else ""
     problem = f"{missing.where} needs {package}{named}, which cannot be imported ({first_line(error)})"
-    also = f"; {', '.join(one.name for one in others)} not installed either: {how_to_install(others)}" if others else ""
+    also = f"; not installed either: {how_to_install(others)}" if others else ""
     if on_cpu and (missing.extension or (own is not None and own.needs_cuda)):
         return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA{also}")
     if not missing.extension:
