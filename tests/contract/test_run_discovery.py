@@ -357,7 +357,7 @@ def test_doctor_says_that_flat_gaussians_have_no_residuals(fork: Path, capsys: p
     [
         ("len(pc.exposure_mapping)", "exposure_mapping"),
         ("helper(pc)", "pretrained_exposures"),
-        ("helper(pc) if pipe.debug else None", None),
+        ("helper(pc) if pipe.antialiasing else None", None),
         ("pc.max_radii2D", None),
     ],
 )
