@@ -21,7 +21,7 @@ app = typer.Typer(
 
 
 def _root(path: Path) -> Path:
-    """Return the root of the checkout that a training script, or a folder of such scripts, is in; others as they are."""
+    """Return the root of the checkout that a training script, or a folder of such scripts, is in; else the path."""
     from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
 
     if path.is_file():

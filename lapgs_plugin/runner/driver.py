@@ -98,7 +98,7 @@ class HierarchyDriver:
             device=place,
             images=SceneImages(),
             wrapper=RasterizerWrapper(parts.mark_render, EarlyVisibility() if options.run_ahead else None),
-            hooks=HookCaller(hooks),
+            hooks=HookCaller(hooks, options.hooks),
             parts=parts,
             watcher=watcher or Watcher(),
             measuring=measuring,
