@@ -135,7 +135,8 @@ def has_begun(folder: Path) -> bool:
     One that failed before its first iteration has none, and its folder can be taken again.
     """
     with one_line_errors(folder, "read"):
-        if any((folder / name).exists() for name in (CHECKPOINT, HISTORY)):
+        history = folder / HISTORY
+        if (folder / CHECKPOINT).exists() or (history.exists() and history.stat().st_size):
             return True
         try:
             return bool(read_json(folder / MANIFEST, dict[str, Any]).get("records"))
