@@ -20,7 +20,8 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.hooks import ALL, HookDispatcher, StageContext, StageHook, entry_point_hooks, hooks_line
+from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks, hooks_line
+from lapgs_plugin.registry import ALL
 
 logger = logging.getLogger(__name__)
 
