@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -17,6 +18,9 @@ DISTRIBUTIONS = {
     "yaml": "pyyaml",
 }
 """Distributions whose names differ from those of their packages."""
+
+BUILT_IN = sys.stdlib_module_names | {"__main__"}
+"""Modules of Python, some of them of other systems."""
 
 INDEX = "pip install "
 README = "install it as the checkout's README says"
@@ -60,7 +64,7 @@ def missing_packages(source: CheckoutSource, extensions: Iterable[str]) -> list[
     """
     compiled = {package_of(module) for module in (*extensions, *source.rasterizer_modules)}
     needed = {package_of(one.name): one.where for one in reversed(source.externals) if not one.optional}
-    absent = [name for name in sorted(needed) if not is_installed(name)]
+    absent = [name for name in sorted(needed.keys() - BUILT_IN) if not is_installed(name)]
     return [MissingPackage(name, needed[name], source.own_package(name), name in compiled) for name in absent]
 
 

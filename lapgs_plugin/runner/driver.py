@@ -129,8 +129,9 @@ class HierarchyDriver:
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
         profile = self._adapter.profile
-        with undisturbed(self._context.device):
-            profile.choose_model(type(profile.make_model(call.values)))
+        if len(profile.source.models) > 1:
+            with undisturbed(self._context.device):
+                profile.choose_model(type(profile.make_model(call.values)))
         with (
             Attachment(self._replacements.in_training()),
             counting_steps(profile, lambda: self._context.stage),
