@@ -19,7 +19,6 @@ import difflib
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 
 from torch import Tensor
 
@@ -33,9 +32,7 @@ from lapgs_plugin.hierarchy.supervision import Reconstructed, Supervision
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT
-
-ENTRY_POINT_GROUP = "lapgs_plugin.hooks"
-"""Entry point group whose members are StageHook classes, created without arguments for every run."""
+from lapgs_plugin.registry import ALL, HOOKS, chosen_entries
 
 
 @dataclass(frozen=True)
@@ -191,14 +188,17 @@ class HookDispatcher:
         supervision: Supervision,
         ssim_weight: float = DEFAULT_SSIM_WEIGHT,
         user_hooks: Sequence[StageHook] = (),
+        registered: str = ALL,
     ) -> HookDispatcher:
         """Return a dispatcher of composition, supervision, the hooks registered by entry point, and `user_hooks`.
+
+        `registered` chooses those by entry point as `entry_point_hooks` takes it.
 
         Raises:
             UserInputError: a user's hook is not usable; the line names it.
         """
         stock = (Composition(), SupervisionLoss(supervision, ssim_weight))
-        return cls((*stock, *entry_point_hooks(), *user_hooks))
+        return cls((*stock, *entry_point_hooks(registered), *user_hooks))
 
     def is_plain(self, stage: Stage) -> bool:
         """Whether the loss of a stage is the photometric loss of the composed image, and no user's hook takes part."""
@@ -269,35 +269,36 @@ class HookDispatcher:
             hook.on_stage_end(stage)
 
 
-def entry_point_hooks() -> tuple[StageHook, ...]:
-    """Return the hooks that installed packages register in the group `ENTRY_POINT_GROUP`, sorted by name.
+def entry_point_hooks(registered: str = ALL) -> tuple[StageHook, ...]:
+    """Return the hooks that installed packages register in the group `registry.HOOKS`, sorted by name.
+
+    Args:
+        registered: "all", "none", or names separated by commas: the value of --hooks.
 
     Raises:
-        UserInputError: one cannot be imported or created, or is not a usable hook; the line names it.
+        UserInputError: a name is unknown; or one cannot be imported or created, or is not a usable hook; the line names
+            it.
     """
     hooks = []
-    for entry in _entries():
+    for entry in chosen_entries("--hooks", HOOKS, registered):
         source = f"entry point {entry.name} ({entry.value})"
         try:
             hook = entry.load()()
         except Exception as error:  # any error of a plugin's code must name the plugin
             raise UserInputError(
                 f"hook {source} cannot be created: {typed_line(error)}; "
-                "expected a StageHook class without arguments, fix or uninstall the package that brings it"
+                "expected a StageHook class without arguments, fix or uninstall the package that brings it, or leave "
+                "it out with --hooks"
             ) from error
         verify_hook(hook, source)
         hooks.append(hook)
     return tuple(hooks)
 
 
-def hooks_line() -> str | None:
-    """Say which hooks installed packages register: they take part in every run. None without any."""
-    found = [f"{entry.name} ({entry.value})" for entry in _entries()]
+def hooks_line(registered: str = ALL) -> str | None:
+    """Say which hooks of installed packages take part in a run, as of `entry_point_hooks`; None without any."""
+    found = [f"{entry.name} ({entry.value})" for entry in chosen_entries("--hooks", HOOKS, registered)]
     return f"hooks of installed packages: {', '.join(found)}" if found else None
-
-
-def _entries() -> list[EntryPoint]:
-    return sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.name, entry.value))
 
 
 HOOK_NAMES = tuple(name for name in vars(StageHook) if not name.startswith("_"))

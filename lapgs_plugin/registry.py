@@ -15,6 +15,39 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+HOOKS = "lapgs_plugin.hooks"
+"""Entry point group whose members are StageHook classes, created without arguments for every run."""
+
+ALL, NONE = "all", "none"
+"""Choices of entry points besides their names."""
+
+
+def chosen_entries(option: str, group: str, chosen: str) -> list[EntryPoint]:
+    """Return entry points of a group, sorted by name.
+
+    Args:
+        option: that chooses them, for the message.
+        group: their group.
+        chosen: "all", "none", or names separated by commas.
+
+    Raises:
+        UserInputError: no installed package registers one of such a name.
+    """
+    from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
+
+    entries = sorted(entry_points(group=group), key=lambda entry: (entry.name, entry.value))
+    if chosen in (ALL, NONE):
+        return entries if chosen == ALL else []
+    names, known = [name.strip() for name in chosen.split(",")], {entry.name for entry in entries}
+    if unknown := [name for name in names if name not in known]:
+        expected = ", ".join([ALL, NONE, *sorted(known)])
+        raise UserInputError(
+            f"{option} {chosen}: no installed package registers {unknown[0]!r}; expected {expected}, or several names "
+            "separated by commas"
+        )
+    return [entry for entry in entries if entry.name in names]
+
+
 class Registry(Generic[T]):
     """Hold the implementations that a user chooses from by name.
 
@@ -36,9 +69,7 @@ class Registry(Generic[T]):
     @cached_property
     def _found(self) -> Mapping[str, EntryPoint]:
         """Entry points of other packages by name."""
-        from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
-
-        entries = sorted(entry_points(group=self.group), key=lambda entry: (entry.name, entry.value))
+        entries = chosen_entries(self._option, self.group, ALL)
         return {entry.name: entry for entry in entries if entry.name not in self._own}
 
     def __iter__(self) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Stand in for packages that checkouts import and that are not installed.
 
 Imports succeed, and so do the few functions that training calls. Any other name of these packages raises
-`MissingExtraError` at its first use. An installed package is always preferred.
+`MissingExtraError` at its first use. An installed package is always preferred. Imports no torch before a call.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
-
-import numpy as np
-import torch
-from PIL import Image
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import MissingExtraError
 
-__all__ = ["NoLog", "absent_modules"]
+if TYPE_CHECKING:
+    from PIL import Image
+    from torch import Tensor
+
+__all__ = ["STOOD_IN", "NoLog", "absent_modules"]
 
 
 def absent_modules(logs: bool = False) -> dict[str, ModuleType]:
@@ -68,6 +67,9 @@ class _ToTensor:
     """Convert an 8-bit picture, grey or RGB, to a float tensor (c, h, w) in [0, 1]."""
 
     def __call__(self, picture: Image.Image) -> Tensor:
+        import numpy as np
+        import torch
+
         pixels = np.asarray(picture)
         if pixels.dtype != np.uint8:
             raise MissingExtraError(
@@ -81,6 +83,10 @@ class _ToPILImage:
     """Convert a float tensor (1, h, w) or (3, h, w) in [0, 1] to an 8-bit picture, rounding down."""
 
     def __call__(self, tensor: Tensor) -> Image.Image:
+        import numpy as np
+        from PIL import Image
+        from torch import Tensor
+
         if not (
             isinstance(tensor, Tensor) and tensor.is_floating_point() and tensor.ndim == 3 and len(tensor) in (1, 3)
         ):
@@ -93,6 +99,8 @@ class _ToPILImage:
 
 
 def _described(value: object) -> str:
+    from torch import Tensor
+
     return (
         f"a tensor {tuple(value.shape)} of {value.dtype}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
     )
@@ -101,6 +109,10 @@ def _described(value: object) -> str:
 def _dump(value: object, path: str) -> None:
     """Pickle a value to a file, which joblib can read."""
     Path(path).write_bytes(pickle.dumps(value))
+
+
+def _nothing(*_: object, **__: object) -> None:
+    """Do nothing, as choosing a backend that draws nothing."""
 
 
 class NoLog:
@@ -132,9 +144,12 @@ _PACKAGES: dict[str, tuple[str, dict[str, dict[str, object]]]] = {
     # Mip-Splatting imports it without using it.
     "open3d": ("open3d", {"open3d": {}}),
     # 2DGS draws curves and depths with it.
-    "matplotlib": ("matplotlib", {"matplotlib": {}, "matplotlib.pyplot": {}, "matplotlib.cm": {}}),
+    "matplotlib": ("matplotlib", {"matplotlib": {"use": _nothing}, "matplotlib.pyplot": {}, "matplotlib.cm": {}}),
     # EfficientGS reads scenes that it has packed, and logs; its logs are left out.
     "joblib": ("joblib", {"joblib": {"dump": _dump}}),
     "h5py": ("h5py", {"h5py": {}}),
 }
 """For each package, the distribution to install and the names that its modules offer here."""
+
+STOOD_IN = tuple(_PACKAGES)
+"""Packages that are stood in for where they are not installed."""

@@ -12,19 +12,16 @@ import inspect
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import FunctionType, ModuleType
 from typing import Any
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.script import Script
-from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, CheckoutSource
-from lapgs_plugin.checkouts.syntax import plain_assignments
-from lapgs_plugin.errors import UserInputError
-
-SCENE_ROLES = ("getTrainCameras", "getTestCameras")
-"""Methods by which the class of a scene is recognised."""
+from lapgs_plugin.checkouts.source import MODEL_ROLES, OTHERWISE, SCENE_ROLES, CheckoutSource
+from lapgs_plugin.checkouts.syntax import called_name, plain_assignments
+from lapgs_plugin.errors import UserInputError, typed_line
 
 CAMERA_ROLES = {"world_view_transform", "image_name"}
 """Attributes that a camera with an image sets when it is made; a viewer's cameras have no image."""
@@ -64,13 +61,12 @@ class Profile:
 
     Attributes:
         source: what its sources say.
-        model: class of the Gaussians.
+        model: class of the Gaussians; `choose_model` finds out which it is where the script does not name it.
         scene: class of the scene, which has the cameras.
         cameras: classes of cameras that have an image.
         training: the script's function that trains.
         renderers: functions that rasterize. A view is recognised when one of them is called with it.
         rasterizers: those that can be imported, that of the training loop first.
-        density_control: methods of the model that add, remove or reset Gaussians, directly or through others.
 
     Raises:
         UserInputError: it is no 3DGS checkout; the line says what is missing and where it was expected.
@@ -86,12 +82,22 @@ class Profile:
         self.cameras = tuple(each for each, make in makers if _attributes_set(make) >= CAMERA_ROLES)
         self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
         self.renderers = tuple(self._find_renderers())
-        self.density_control = tuple(sorted(_changing(self.model)))
         self._model_call = self._first_call(self.script_names(self.model))
         self._scene_call = self._first_call(self.script_names(self.scene))
         self._loop_call = self._first_call({n for f in self.renderers for n in (*self.script_names(f), f.__name__)})
         self.loop_renderer = self._find_loop_renderer()
         self.rasterizers = tuple(self._find_rasterizers())
+
+    @property
+    def density_control(self) -> tuple[str, ...]:
+        """Names of the model's methods that add, remove or reset Gaussians, directly or through others."""
+        return tuple(sorted(_changing(self.model)))
+
+    def choose_model(self, model: type) -> None:
+        """Note which class the script makes its model of."""
+        self.model = model
+        chosen = next((each for each in self.source.models if each[0] == model.__name__), self.source.model)
+        self.source = replace(self.source, model=chosen)
 
     @property
     def modules(self) -> list[ModuleType]:
@@ -126,12 +132,33 @@ class Profile:
         return found if any(vars(holder)[name] is other for other in others) else [*found, (holder, name)]
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
-        """Return a model, made with the arguments that the script gives.
+        """Return a model, made with the arguments that the script gives, or by its statements if it names no class.
 
         Args:
             values: arguments of the training function by parameter name.
+
+        Raises:
+            UserInputError: the statements fail outside of the training loop, or make something else.
         """
-        return self._call(self.model, self._model_call, values, {})
+        if self._model_call is not None and len(self.source.models) == 1:
+            return self._call(self.model, self._model_call, values, {})
+        statements, name = self.source.model_statements, self.source.model_variable
+        if not statements:
+            return self._call(self.model, self._model_call, values, {})
+        names, where = {**vars(self.script.module), **values}, self.source.place(statements[-1])
+        try:
+            exec(compile(ast.Module(statements, []), str(self.script.path), "exec", dont_inherit=True), names)
+        except Exception as error:  # the statements need something that exists in the loop only
+            raise UserInputError(
+                f"{where}: {name} cannot be made outside of the training loop ({typed_line(error)}), expected "
+                f"statements that take the arguments of {self.source.training.name}(); {OTHERWISE}"
+            ) from error
+        if not all(hasattr(names[name], role) for role in MODEL_ROLES):
+            raise UserInputError(
+                f"{where}: {name} is a {type(names[name]).__name__}, expected Gaussians with "
+                f"{' and '.join(MODEL_ROLES)}; {OTHERWISE}"
+            )
+        return names[name]
 
     def make_scene(self, values: Mapping[str, Any], model: Any) -> Any:
         """Return a scene, made with the arguments that the script gives.
@@ -144,7 +171,7 @@ class Profile:
             raise UserInputError(
                 f"{self._training_place}() makes no {self.scene.__name__}, expected a scene of its own; {OTHERWISE}"
             )
-        return self._call(self.scene, self._scene_call, {**values, self._model_variable: model}, {})
+        return self._call(self.scene, self._scene_call, {**values, self.source.model_variable: model}, {})
 
     def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **given: Any) -> Any:
         """Render a view as the training loop does, and return what its function returns.
@@ -233,7 +260,7 @@ class Profile:
         """Return the function that the training loop renders with."""
         if self._loop_call is None:
             return None
-        name = _called_name(self._loop_call)
+        name = called_name(self._loop_call)
         held = vars(self.script.module).get(name)
         return next((found for found in self.renderers if found is held or found.__name__ == name), None)
 
@@ -264,18 +291,8 @@ class Profile:
         nodes = list(ast.walk(self.source.training))
         beside = [node for node in nodes if isinstance(node, ast.Try) or _records_no_gradients(node)]
         tried = {id(inner) for node in beside for inner in ast.walk(node)}
-        calls = [node for node in nodes if isinstance(node, ast.Call) and _called_name(node) in names]
+        calls = [node for node in nodes if isinstance(node, ast.Call) and called_name(node) in names]
         return min(calls, key=lambda call: (id(call) in tried, call.lineno), default=None)
-
-    @property
-    def _model_variable(self) -> str:
-        """Name of the training function's variable for the model."""
-        made = (
-            node.targets[0].id
-            for node in ast.walk(self.source.training)
-            if isinstance(node, ast.Assign) and node.value is self._model_call and isinstance(node.targets[0], ast.Name)
-        )
-        return next(made, "gaussians")
 
     def _call(
         self,
@@ -354,12 +371,7 @@ def _records_no_gradients(node: ast.AST) -> bool:
     if not isinstance(node, ast.With):
         return False
     calls = [item.context_expr for item in node.items if isinstance(item.context_expr, ast.Call)]
-    return any(_called_name(call) == "no_grad" for call in calls)
-
-
-def _called_name(call: ast.Call) -> str:
-    """Return the name that is called, without the module or object before it."""
-    return str(getattr(call.func, "id", None) or getattr(call.func, "attr", ""))
+    return any(called_name(call) == "no_grad" for call in calls)
 
 
 @lru_cache(maxsize=64)  # asked for in every iteration of joint training

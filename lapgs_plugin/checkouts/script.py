@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, ModuleType, TracebackType
 
+from lapgs_plugin.checkouts.other_trainers import known_trainer
 from lapgs_plugin.checkouts.syntax import parsed
 from lapgs_plugin.errors import UserInputError
 
@@ -52,9 +53,10 @@ def require_script(path: Path) -> Path:
         UserInputError: it is not a file.
     """
     if not path.is_file():
-        raise UserInputError(
-            f"{path} is not a file; expected the training script of a checkout, as in `lapgs run train.py -s SCENE`"
+        advice = (
+            known_trainer(path) or "expected the training script of a checkout, as in `lapgs run train.py -s SCENE`"
         )
+        raise UserInputError(f"{path} is not a file; {advice}")
     return path.absolute()
 
 

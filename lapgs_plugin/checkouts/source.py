@@ -9,23 +9,40 @@ import ast
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
+from lapgs_plugin.checkouts.conditions import Branches, default_options
+from lapgs_plugin.checkouts.other_trainers import advice_for
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse, uses_of_rasterizers
 from lapgs_plugin.checkouts.syntax import (
     called_methods,
+    called_name,
     called_names,
     executed_on_import,
     parsed,
     parsed_quietly,
     place,
+    stored_names,
 )
 from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import as_pip_argument
 
-MODEL_ROLES = ("get_xyz", "training_setup")
+SETUP = "training_setup"
+"""Method of the Gaussians that makes their optimizer."""
+
+MODEL_ROLES = ("get_xyz", SETUP)
 """Methods by which the class of the Gaussians is recognised."""
+
+SCENE_ROLES = ("getTrainCameras", "getTestCameras")
+"""Methods by which the class of a scene is recognised."""
+
+START = "create_from_pcd"
+"""Method of the family's models that makes Gaussians of a scene's points."""
+
+FROM_RUN = "load_iteration"
+"""Argument of the family's scenes that says which finished model they read."""
 
 SCALES = re.compile(r"\w*scal.*\.repeat\(1, ([0-9])\).*", re.DOTALL)
 """Statement by which models of the family give a point one scale along each of its axes."""
@@ -47,7 +64,7 @@ class External:
         name: full name of the module.
         names: names that are imported from it.
         where: file and line of its import.
-        optional: whether the import may fail: in a `try`, or in a function that may never be called.
+        optional: whether the import may fail or be left out: in a `try`, in a branch, or in a function.
     """
 
     name: str
@@ -84,7 +101,8 @@ class CheckoutSource:
         root: folder of the checkout; the script may lie in a folder below it.
         modules: files of the checkout's modules that the script imports, directly or not.
         externals: modules that these import from elsewhere.
-        model: class of the Gaussians, and its file and line.
+        model: class of the Gaussians, and its file and line: the first of `models` where the sources do not tell it.
+        models: classes that the script may make its model of, as `model`.
         rasterizers: how rasterizers are used.
         training: the script's function that trains.
     """
@@ -94,6 +112,7 @@ class CheckoutSource:
     modules: Mapping[str, Path]
     externals: tuple[External, ...]
     model: tuple[str, str]
+    models: tuple[tuple[str, str], ...]
     rasterizers: tuple[RasterizerUse, ...]
     training: ast.FunctionDef = field(repr=False)
 
@@ -117,31 +136,61 @@ class CheckoutSource:
     @classmethod
     def _read(cls, script: Path, given: Path) -> CheckoutSource:
         tree = parsed(script)
-        near = ""
+        near, training = "", _find_training(tree)
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
             modules = dict(_reachable(script, (script.parent, root)))
-            found, close = _find_model(modules, root, called_names(ast.walk(tree)))
+            models, close = _find_models(modules, root)
             near = near or close
-            if found is not None:
+            if models:
                 break
         else:
             raise UserInputError(
                 f"{given} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
-                f"with {' and '.join(MODEL_ROLES)}; {OTHERWISE}"
+                f"with {' and '.join(MODEL_ROLES)}; {advice_for(_packages(tree, script))}"
             )
-        training = _find_training(tree)
         if training is None:
             raise UserInputError(
                 f"{given} has no function that its main block calls and that calls backward(), expected a function "
-                f"like training(dataset, opt, pipe, ...); {OTHERWISE}"
+                f"like training(dataset, opt, pipe, ...); {advice_for(_packages(tree, script))}"
             )
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
-        externals = tuple(_externals(modules, root))
-        return cls(script, root, modules, externals, found, uses, training)
+        needed = {name for name, _ in _reachable(script, (script.parent, root), surely=True)}
+        externals = tuple(_externals(modules, root, needed))
+        # One that the script makes, if it names any; others may be their bases.
+        called = (
+            {*called_names(nodes), *called_methods(nodes)} for nodes in map(list, map(ast.walk, (training, tree)))
+        )
+        named = ([model for model in models if model[0] in names] for names in called)
+        models = next(filter(None, named), models)
+        return cls(script, root, modules, externals, models[0], tuple(models), uses, training)
 
     def place(self, node: ast.AST) -> str:
         """Return the file and line of a node of the script."""
         return f"{self.script.relative_to(self.root)}:{getattr(node, 'lineno', 0)}"
+
+    @property
+    def model_variable(self) -> str:
+        """Name of the training function's variable for the model."""
+        set_up, made, models = list[str](), list[str](), dict(self.models)
+        for node in sorted(ast.walk(self.training), key=lambda node: getattr(node, "lineno", 0)):
+            if isinstance(node, ast.Attribute) and node.attr == SETUP and isinstance(node.value, ast.Name):
+                set_up.append(node.value.id)
+            elif (
+                isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and called_name(node.value) in models
+            ):
+                made += [target.id for target in node.targets if isinstance(target, ast.Name)]
+        return next((name for name in set_up if name in made), next(iter((*made, *set_up)), "gaussians"))
+
+    @property
+    def model_statements(self) -> list[ast.stmt]:
+        """Statements of the training function that make the model before it is set up, and what they need."""
+        body, names, kept = self.training.body, {self.model_variable}, list[ast.stmt]()
+        ends = (i for i, node in enumerate(body) if SETUP in called_methods(ast.walk(node)))
+        for node in reversed(body[: next(ends, 0)]):
+            if names & stored_names(node):
+                kept.insert(0, node)
+                names |= {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+        return kept
 
     @property
     def scale_axes(self) -> tuple[int, str] | None:
@@ -163,7 +212,7 @@ class CheckoutSource:
                 return ", ".join(map(ast.unparse, given.elts)), self.place(given)
         return None
 
-    def hindrance(self, parameters: Iterable[str]) -> str | None:
+    def hindrance(self, parameters: Collection[str]) -> str | None:
         """Return why no level can be trained; None if the sources do not say.
 
         Args:
@@ -173,9 +222,51 @@ class CheckoutSource:
             return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
         if (several := self.image_scales) is not None:
             return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
-        parameters = [each.arg for each in self.training.args.args]
-        absent_roles = (role for role in NEEDED if self._is_nested(role, parameters))
-        return next((lacks_role(self.training.name, parameters, role) for role in absent_roles), None)
+        arguments = [each.arg for each in self.training.args.args]
+        if role := next((role for role in NEEDED if self._is_nested(role, arguments)), None):
+            return lacks_role(self.training.name, arguments, role)
+        return self.of_finished_model or self._explain_frozen_model(parameters)
+
+    @cached_property
+    def of_finished_model(self) -> str | None:
+        """How the training function takes Gaussians from elsewhere than a scene's points; None if it does not.
+
+        A script that trains segmentations, features or trees on a finished model is one.
+        """
+        functions = [node for node in self._nodes() if isinstance(node, ast.FunctionDef)]
+        callers = (node for node in functions if node.name != "restore")  # of a checkpoint
+        if not any(SETUP in called_methods(ast.walk(node)) for node in callers):
+            return f"it trains something else than {self.model[0]}: {self.place(self.training)} calls no {SETUP}"
+        classes = self.classes
+        for node in (each for each in ast.walk(self.training) if isinstance(each, ast.Call)):
+            name = called_name(node)
+            methods = methods_of(classes[name], classes)[0] if name in classes else {}
+            if "__init__" not in methods or not methods.keys() >= set(SCENE_ROLES):
+                continue
+            made, known = methods["__init__"], self.branches.arguments(methods["__init__"], node)
+            possible = called_methods(self.branches.executed(made, known, surely=False))
+            if known.get(FROM_RUN) or (START in called_methods(ast.walk(made)) and START not in possible):
+                return f"it trains on a finished model: {self.place(node)}: {ast.unparse(node)} makes none of points"
+        return None
+
+    def _explain_frozen_model(self, parameters: Collection[str]) -> str | None:
+        """Return what the model's optimizer steps by default, if that is none of `parameters`; else None."""
+        setup = methods_of(self.classes[self.model[0]], self.classes)[0].get(SETUP)
+        if setup is None or not parameters or "super" in called_names(ast.walk(setup)):
+            return None
+        nodes = self.branches.executed(setup, {}, surely=False)
+        groups = [node for node in nodes if isinstance(node, ast.Dict)]
+        values = [v for group in groups for k, v in zip(group.keys, group.values, strict=True) if _is(k, "params")]
+        stepped = {node.attr for value in values for node in ast.walk(value) if isinstance(node, ast.Attribute)}
+        if not stepped or stepped.intersection(parameters):
+            return None
+        names = ", ".join(sorted(stepped))
+        return f"it trains on a finished model: by default its optimizer ({self.model[1]}) steps {names} alone"
+
+    @cached_property
+    def branches(self) -> Branches:
+        """What its functions execute by default."""
+        return Branches(default_options(map(parsed_quietly, self.modules.values())))
 
     def _is_nested(self, role: str, parameters: Collection[str]) -> bool:
         """Return whether only parts of arguments have a role: training reads `cfg.opt.iterations`, no `opt.iterations`.
@@ -197,7 +288,7 @@ class CheckoutSource:
         known = self.attributes
         return [name for name in names if name not in known]
 
-    @property
+    @cached_property
     def classes(self) -> dict[str, ast.ClassDef]:
         """Classes of its modules by name."""
         trees = [parsed_quietly(path) for path in self.modules.values()]
@@ -252,25 +343,37 @@ def training_scripts(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
 
 
-def readable_source(folder: Path) -> CheckoutSource | None:
-    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+def readable_sources(folder: Path) -> tuple[list[CheckoutSource], list[UserInputError]]:
+    """Return the sources of a folder's training scripts that are ones of 3DGS, and why others are not.
+
+    Those that train on a finished model come last.
+    """
+    sources, problems = list[CheckoutSource](), list[UserInputError]()
     for script in training_scripts(folder):
         try:
-            source = CheckoutSource.read(script)
-        except UserInputError:
-            continue
-        if source.root == folder.absolute():
-            return source
-    return None
+            sources.append(CheckoutSource.read(script))
+        except UserInputError as error:
+            problems.append(error)
+    return sorted(sources, key=lambda source: source.of_finished_model is not None), problems
 
 
-def _reachable(script: Path, folders: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
-    """Yield the checkout's modules that a script imports, the script itself first, with their files."""
+def readable_source(folder: Path) -> CheckoutSource | None:
+    """Return the sources of a folder's first training script that is one of 3DGS; None if there is none."""
+    sources, _ = readable_sources(folder)
+    return next((source for source in sources if source.root == folder.absolute()), None)
+
+
+def _reachable(script: Path, folders: tuple[Path, ...], *, surely: bool = False) -> Iterator[tuple[str, Path]]:
+    """Yield the checkout's modules that a script imports, the script itself first, with their files.
+
+    With `surely`, those that it imports whichever way branches go.
+    """
     waiting, seen = [("__main__", script)], {"__main__"}
     while waiting:
         name, path = waiting.pop(0)
         yield name, path
-        for node in ast.walk(parsed_quietly(path)):
+        tree = parsed_quietly(path)
+        for node in executed_on_import(tree.body, surely=True) if surely else ast.walk(tree):
             for imported in _imported(node, name, path):
                 file = _file_of(imported, folders)
                 if file is not None and imported not in seen:
@@ -295,6 +398,11 @@ def _imported(node: ast.AST, module: str, path: Path) -> Iterator[str]:
         yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
 
 
+def _packages(tree: ast.Module, script: Path) -> set[str]:
+    """Return the names of packages that a script imports."""
+    return {name.partition(".")[0] for node in ast.walk(tree) for name in _imported(node, "__main__", script)}
+
+
 def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
     for folder in folders:
         place = folder.joinpath(*name.split("."))
@@ -304,12 +412,9 @@ def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
     return None
 
 
-def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]) -> tuple[tuple[str, str] | None, str]:
-    """Return the name and place of the Gaussians' class, and the place of one that only resembles it.
-
-    Of several classes it is one that the script calls, `called`: others may be its bases.
-    """
-    near = ""
+def _find_models(modules: Mapping[str, Path], root: Path) -> tuple[list[tuple[str, str]], str]:
+    """Return the names and places of classes of Gaussians, and the place of one that only resembles them."""
+    near, models = "", []
     classes = {
         node.name: (node, path)
         for path in modules.values()
@@ -317,16 +422,20 @@ def _find_model(modules: Mapping[str, Path], root: Path, called: Collection[str]
         if isinstance(node, ast.ClassDef)
     }
     nodes = {name: node for name, (node, _) in classes.items()}
-    for name, (node, path) in sorted(classes.items(), key=lambda each: each[0] not in called):
+    for name, (node, path) in classes.items():
         methods, whole = methods_of(node, nodes)
         if "training_setup" not in methods:
             continue
         where = place(path, root, node.lineno)
         if whole and (lacks := set(MODEL_ROLES) - methods.keys()):
             near = f"{name} in {where} lacks {', '.join(lacks)}, and no other of its imports"
-            continue
-        return (name, where), ""
-    return None, near
+        else:
+            models.append((name, where))
+    return models, near
+
+
+def _is(key: ast.expr | None, text: str) -> bool:
+    return isinstance(key, ast.Constant) and key.value == text
 
 
 def methods_of(node: ast.ClassDef, classes: Mapping[str, ast.ClassDef]) -> tuple[dict[str, ast.FunctionDef], bool]:
@@ -353,11 +462,11 @@ def _find_training(tree: ast.Module) -> ast.FunctionDef | None:
     return next((each for each in found if "backward" in called_methods(ast.walk(each))), None)
 
 
-def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
-    """Yield imports of modules that are not in the checkout."""
-    for path in modules.values():
+def _externals(modules: Mapping[str, Path], root: Path, needed: Collection[str]) -> Iterator[External]:
+    """Yield imports of modules that are not in the checkout; its own modules `needed` are imported for sure."""
+    for module, path in modules.items():
         tree = parsed_quietly(path)
-        needed = {id(node) for node in executed_on_import(tree.body, surely=True)}
+        sure = {id(node) for node in executed_on_import(tree.body, surely=True)} if module in needed else set()
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 imports: dict[str, tuple[str, ...]] = {alias.name: () for alias in node.names}
@@ -369,4 +478,4 @@ def _externals(modules: Mapping[str, Path], root: Path) -> Iterator[External]:
             for each, names in imports.items():
                 own = each.partition(".")[0] in modules or any(name.startswith(f"{each}.") for name in modules)
                 if each not in modules and not own:
-                    yield External(each, names, where, id(node) not in needed)
+                    yield External(each, names, where, id(node) not in sure)

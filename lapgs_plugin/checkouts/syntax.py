@@ -37,7 +37,7 @@ def parsed_quietly(path: Path) -> ast.Module:
 
 def executed_on_import(body: Iterable[ast.AST], *, surely: bool = False) -> Iterator[ast.AST]:
     """Yield statements that importing a module may execute; with `surely` those that it does, whatever fails."""
-    excused = (ast.Try, ast.With) if surely else ()  # `with suppress(ImportError)`
+    excused = (ast.Try, ast.With, ast.If) if surely else ()  # `with suppress(ImportError)`
     for node in body:
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, *excused)):
             yield node
@@ -68,13 +68,20 @@ def _only_assigns(node: ast.stmt) -> bool:
 
 
 def stored_names(node: ast.AST) -> set[str]:
-    """Return the names of variables that a node sets."""
-    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
+    """Return the names of variables that a node sets or imports."""
+    nodes = list(ast.walk(node))
+    imported = {(each.asname or each.name).partition(".")[0] for each in nodes if isinstance(each, ast.alias)}
+    return imported | {each.id for each in nodes if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
 
 
 def place(path: Path, root: Path, line: int) -> str:
     """Return a line of a file as `file:line`, relative to the checkout's root if the file is below it."""
     return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"
+
+
+def called_name(call: ast.Call) -> str:
+    """Return the name that is called, without the module or object before it; empty for other expressions."""
+    return str(getattr(call.func, "id", None) or getattr(call.func, "attr", ""))
 
 
 def called_names(nodes: Iterable[ast.AST]) -> list[str]:

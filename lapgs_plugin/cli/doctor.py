@@ -98,7 +98,7 @@ def examine() -> dict[str, list[Finding]]:
 def current_folder(folder: Path, has_gpu: bool) -> Finding:
     """Return whether a folder is a checkout, and on which device `lapgs run` would train it."""
     from lapgs_plugin.adapters.registry import recognise
-    from lapgs_plugin.checkouts.source import training_scripts
+    from lapgs_plugin.checkouts.source import readable_sources
     from lapgs_plugin.environment.findings import Finding
 
     try:
@@ -107,7 +107,12 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
         return Finding("Current folder", "problem", str(error))
     if adapter is not None:
         place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
-        names = [str(path.relative_to(folder)) for path in training_scripts(folder)]
+        parameters = adapter.archived_parameters()
+        sources = [(each.script, each.hindrance(parameters)) for each in readable_sources(folder)[0]]
+        names = [str(path.relative_to(folder.absolute())) for path, why in sources if why is None]
+        if sources and not names:
+            detail = f"a checkout of {adapter.info.title} or a fork of it, without levels: {sources[0][1]}"
+            return Finding("Current folder", "absent", detail)
         script = adapter.info.script if adapter.info.script in names or not names else names[0]
         detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run {script} ...` trains it on {place}"
         return Finding("Current folder", "ok", detail)

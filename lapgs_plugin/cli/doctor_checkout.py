@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import sys
+import ast
+from dataclasses import replace
 from pathlib import Path
 
 from lapgs_plugin.adapters.base import PARAMETERS
 from lapgs_plugin.adapters.registry import adapter_class, known_extensions
 from lapgs_plugin.checkouts.model_values import explain_values_beside
+from lapgs_plugin.checkouts.other_trainers import known_trainer
+from lapgs_plugin.checkouts.packages import README, missing_packages, package_of
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
-from lapgs_plugin.checkouts.source import CheckoutSource, training_scripts
+from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
 from lapgs_plugin.environment import is_installed
 from lapgs_plugin.environment.findings import Finding
 from lapgs_plugin.errors import MissingExtraError, UserInputError
-
-README = "install it as the checkout's README says"
 
 COLORS = {"shs", "colors_precomp"}
 """Inputs of rasterizers by which a residual gets colours of both signs."""
@@ -32,7 +33,6 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             and none of them is `train.py` in its root.
     """
     source, others = _source(path)
-    more = [f"{', '.join(others)}; describe one with `lapgs doctor {path / others[0]}`"] if others else []
     unused = f"none of the {len(source.modules)} modules that the script imports uses one"
     adapter = adapter_class(source.root)
     parameters = ", ".join(argument.arg for argument in source.training.args.args)
@@ -41,39 +41,52 @@ def describe(path: Path) -> dict[str, list[Finding]]:
             Finding("Root", "ok", str(source.root)),
             Finding("Adapter", "ok", f"{adapter.info.title} (--backbone {adapter.info.name})"),
             Finding("Training", "ok", f"{source.place(source.training)}: {source.training.name}({parameters})"),
-            *(Finding("Other scripts", "ok", text) for text in more),
-            Finding("Gaussians", "ok", f"{source.model[1]}: {source.model[0]}"),
+            *others,
+            Finding("Gaussians", "ok", _gaussians(source)),
         ],
         "Rasterizers": [_rasterizer(use, source) for use in source.rasterizers] or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
-        "lapgs run": [*_kinds(source), _stand_in(source)],
+        "lapgs run": [*_kinds_of_models(source), _stand_in(source)],
     }
 
 
-def _source(path: Path) -> tuple[CheckoutSource, list[str]]:
-    """Return the sources of the training script to describe, and the names of other training scripts."""
+def _source(path: Path) -> tuple[CheckoutSource, list[Finding]]:
+    """Return the sources of the training script to describe, and what is said of other training scripts."""
     if path.is_file():
         return CheckoutSource.read(path), []
-    found: dict[str, CheckoutSource] = {}
-    problems: list[UserInputError] = []
-    for script in training_scripts(path.absolute()):
-        try:
-            found[str(script.relative_to(path.absolute()))] = CheckoutSource.read(script)
-        except UserInputError as error:
-            problems.append(error)
-    if not found:
+    if (advice := known_trainer(path)) is not None:
+        raise UserInputError(f"{path} is no 3DGS checkout: {advice}")
+    sources, problems = readable_sources(path.absolute())
+    if not sources:
         lacks = "has no train*.py" if path.exists() else "does not exist"
         missing = f"{path} {lacks}, expected the root of a 3DGS checkout, or its training script"
         raise problems[0] if problems else UserInputError(missing)
-    names = list(found)
-    if len(names) > 1 and names[0] != "train.py":
-        usual = adapter_class(found[names[0]].root).info.script
+    scripts = {str(source.script.relative_to(path.absolute())): source for source in sources}
+    hindered = {name: why for name, source in scripts.items() if (why := _hindrance(source)) is not None}
+    useful = [name for name in scripts if name not in hindered] or list(scripts)
+    if len(useful) > 1 and useful[0] != "train.py":
+        usual = adapter_class(scripts[useful[0]].root).info.script
         raise UserInputError(
-            f"{path} has several training scripts: {', '.join(names)}; expected one of them, as in "
-            f"`lapgs doctor {path / (usual if usual in names else names[0])}`"
+            f"{path} has several training scripts: {', '.join(useful)}; expected one of them, as in "
+            f"`lapgs doctor {path / (usual if usual in useful else useful[0])}`"
         )
-    return found[names[0]], names[1:]
+    first, *more = useful
+    beside = [f"{', '.join(more)}; describe one with `lapgs doctor {path / more[0]}`"] if more else []
+    unused = [Finding(name, "absent", why) for name, why in hindered.items() if name not in useful]
+    return scripts[first], [*(Finding("Other scripts", "ok", text) for text in beside), *unused]
+
+
+def _hindrance(source: CheckoutSource) -> str | None:
+    return source.hindrance(adapter_class(source.root).archived_parameters())
+
+
+def _gaussians(source: CheckoutSource) -> str:
+    """Return the class of the Gaussians with its place, or all that the script may choose."""
+    if len(source.models) == 1:
+        return f"{source.model[1]}: {source.model[0]}"
+    choice = [f"{source.place(node)} chooses: {ast.unparse(node)}" for node in source.model_statements[-1:]]
+    return "; ".join([", ".join(f"{where}: {name}" for name, where in source.models), *choice])
 
 
 def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
@@ -83,29 +96,17 @@ def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
         return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):
         return Finding(use.module, "ok", detail)
-    return Finding(use.module, "absent", f"not installed; {detail}", _how_to_install(use.module, source, README))
-
-
-def _how_to_install(module: str, source: CheckoutSource, otherwise: str = "") -> str:
-    own = source.own_package(_package(module))
-    return otherwise if own is None else own.install
+    own = source.own_package(package_of(use.module))
+    return Finding(use.module, "absent", f"not installed; {detail}", README if own is None else own.install)
 
 
 def _packages(source: CheckoutSource) -> list[Finding]:
-    """Return packages that the script cannot do without and that are not installed."""
-    needed = {one.name.partition(".")[0]: one for one in reversed(source.externals) if not one.optional}
-    known = sys.stdlib_module_names | {module.partition(".")[0] for module in source.rasterizer_modules}
-    missing = {name: one for name, one in needed.items() if name not in known and not is_installed(name)}
+    """Return packages that the script cannot do without and that are not installed, besides rasterizers."""
+    rasterizers = set(map(package_of, source.rasterizer_modules))
+    missing = [one for one in missing_packages(source, known_extensions()) if one.name not in rasterizers]
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
-    return [
-        Finding(name, "absent", f"{one.where} imports it; not installed", _how_to_install(name, source))
-        for name, one in sorted(missing.items())
-    ]
-
-
-def _package(module: str) -> str:
-    return module.partition(".")[0]
+    return [Finding(one.name, "absent", f"{one.where} imports it; not installed", one.install) for one in missing]
 
 
 def _schedule(source: CheckoutSource) -> list[Finding]:
@@ -114,8 +115,19 @@ def _schedule(source: CheckoutSource) -> list[Finding]:
     return [Finding(place, "ok", event) for place, _, event in lines] or [Finding("none", "ok", "counts no iterations")]
 
 
+def _kinds_of_models(source: CheckoutSource) -> list[Finding]:
+    """Return which kinds of hierarchy work; where the script may choose several models, with the first of them."""
+    first, *others = ((name, _kinds(replace(source, model=(name, where)))) for name, where in source.models)
+    findings = []
+    for i, finding in enumerate(first[1]):
+        more = [f"{name}: {kinds[i].detail}" for name, kinds in others if kinds[i].detail != finding.detail]
+        detail = "; ".join([f"{first[0]}: {finding.detail}", *more]) if more else finding.detail
+        findings.append(replace(finding, detail=detail))
+    return findings
+
+
 def _kinds(source: CheckoutSource) -> list[Finding]:
-    if why := source.hindrance(adapter_class(source.root).archived_parameters()):
+    if why := _hindrance(source):
         return [Finding(kind, "absent", why) for kind in ("nested", "laplacian")]
     taken = {module: set[str]() for module in source.rasterizer_modules}
     for use in source.rasterizers:
@@ -127,6 +139,8 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
         return [nested, Finding("laplacian", "absent", f"residuals need three scale axes; {axes[1]} makes {axes[0]}")]
     if why := explain_values_beside(source, PARAMETERS):
         return [nested, Finding("laplacian", "absent", why)]
+    if why := explain_values_beside(source, PARAMETERS, surely=False):
+        more = f"{more}: perhaps {why}"
     blind = [module for module, inputs in taken.items() if not inputs]
     if len(blind) < len(taken):
         takes = " and ".join(sorted(set[str]().union(*taken.values())))
@@ -137,10 +151,10 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
 
 
 def _stand_in(source: CheckoutSource) -> Finding:
-    stood_in = {*map(_package, known_extensions()), *map(_package, source.rasterizer_modules)}
+    stood_in = {*map(package_of, known_extensions()), *map(package_of, source.rasterizer_modules)}
     for one in source.externals:
-        own = None if one.optional or _package(one.name) in stood_in else source.own_package(_package(one.name))
-        if own is not None and own.needs_cuda and not is_installed(_package(one.name)):
+        own = None if one.optional or package_of(one.name) in stood_in else source.own_package(package_of(one.name))
+        if own is not None and own.needs_cuda and not is_installed(package_of(one.name)):
             why = f"no CPU stand-in for {one.name}, which {one.where} imports from {own.folder}; it needs a CUDA device"
             return Finding("--device cpu", "absent", why)
     try:

@@ -19,8 +19,25 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
+
+def _root(path: Path) -> Path:
+    """Return the root of the checkout that a training script, or a folder of such scripts, is in; else the path."""
+    from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
+
+    if path.is_file():
+        return CheckoutSource.read(path).root
+    sources, _ = readable_sources(path)
+    inside = [source.root for source in sources if path.absolute().is_relative_to(source.root)]
+    return inside[0] if inside and inside[0] != path.absolute() else path
+
+
 Checkout = Annotated[
-    Path, typer.Argument(metavar="CHECKOUT", help="Checkout of a 3DGS codebase, or the folder of its rasterizer.")
+    Path,
+    typer.Argument(
+        metavar="CHECKOUT",
+        help="Checkout of a 3DGS codebase, a training script in it, or the folder of its rasterizer.",
+        callback=_root,
+    ),
 ]
 SetName = Annotated[
     str,

@@ -91,8 +91,9 @@ def run(
     import logging
 
     from lapgs_plugin.checkouts.script import require_script
+    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.environment.device import chosen_device
-    from lapgs_plugin.runs.gpu_busy import require_cuda
+    from lapgs_plugin.runner.installed_packages import require_packages
 
     if options.off and (idle := sorted(given_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
@@ -100,14 +101,19 @@ def run(
     plain = options.off and not options.record
     if measuring.gpu_busy and plain:
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
-    device = chosen_device(options.device, "--device cpu runs the checkout on CPU stand-ins")
-    if measuring.gpu_busy:
-        require_cuda(device)
+    # What is refused by the sources alone is refused before PyTorch is imported.
     path, words = require_script(script), arguments or []
-    watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
     kind, root = _recognised(script, options.backbone, needed=not plain)
     if kind is not None and not options.off:
         _require_levels(script, kind)
+        if not isinstance(context.obj, Rehearsal):
+            require_packages(CheckoutSource.read(script), options.device)
+    device = chosen_device(options.device, "--device cpu runs the checkout on CPU stand-ins")
+    if measuring.gpu_busy:
+        from lapgs_plugin.runs.gpu_busy import require_cuda
+
+        require_cuda(device)
+    watcher = context.with_resource(watching(options.viewing, path.parent.name, device))
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
@@ -131,10 +137,15 @@ def _execute(
     watcher: Watcher,
 ) -> None:
     """Execute the script: with a hierarchy, or unchanged with --off."""
+    from lapgs_plugin.checkouts.source import CheckoutSource
+
+    variant, neighbours = None, False
+    if device == "cpu" and kind is not None:
+        variant = kind.stand_in_for(root, arguments)
+        neighbours = CheckoutSource.read(script).unpacks("distCUDA2")
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
-    from lapgs_plugin.checkouts.source import CheckoutSource
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
@@ -142,8 +153,6 @@ def _execute(
 
     on_device: AbstractContextManager[None] = nullcontext()
     if device == "cpu":
-        variant = None if kind is None else kind.stand_in_for(root, arguments)
-        neighbours = kind is not None and CheckoutSource.read(script).unpacks("distCUDA2")
         on_device = cuda_on_cpu(variant, neighbours=neighbours)
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(script, arguments) as loaded:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-
 from lapgs_plugin.errors import UserInputError
 
 DEVICES = ("auto", "cuda", "cpu")
@@ -17,7 +15,11 @@ def chosen_device(device: str, advice: str = "`lapgs doctor` says why, or use --
     """
     if device not in DEVICES:
         raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
+    if device == "cpu":
+        return device
+    import torch  # takes seconds: what is refused on a CPU is refused without it
+
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise UserInputError(f"--device cuda: PyTorch finds no CUDA device; {advice}")
-    return "cuda" if available and device != "cpu" else "cpu"
+    return "cuda" if available else "cpu"

@@ -11,6 +11,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY, DEFAULT_SPLITS, Hierarchy, Stage, require_shares
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED, SUPERVISIONS
 from lapgs_plugin.options import check_values, option, option_name, require_positive
+from lapgs_plugin.registry import ALL, HOOKS, chosen_entries
 
 GRIDS = ("camera", "even")
 """Pixel grids of a pyramid; see `pyramid`."""
@@ -163,6 +164,9 @@ class HierarchySettings:
         panel=STORAGE,
         choices=(AUTO, *PRECISIONS),
     )
+    hooks: str = option(
+        ALL, "Hooks of installed packages that take part: all, none, or their names, such as smooth,depth.", panel="Run"
+    )
     seed: int = option(0, "Seed of all random choices; added to the seeds that a checkout's script sets.", panel="Run")
 
     def __post_init__(self) -> None:
@@ -170,6 +174,8 @@ class HierarchySettings:
         if self.protocol == "paper":
             self._follow_the_paper()
         SUPERVISIONS[self.supervision]  # raises for an unknown name
+        if self.hooks != ALL:
+            chosen_entries("--hooks", HOOKS, self.hooks)  # as well
         if not 0 <= self.seed < 2**32:
             raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
         if self.split is not None:

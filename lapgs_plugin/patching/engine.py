@@ -6,6 +6,7 @@ is idempotent and replaces edits of an older version.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -19,6 +20,9 @@ from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokeni
 
 ALL_SETS = "all"
 """Name for all sets: all to revert, or all that are not opt-in to apply."""
+
+DEPTH = 4
+"""How many folders below a checkout its extensions are searched: of a checkout within another one, too."""
 
 _SKIPPED_FOLDERS = frozenset({"build", "dist", "third_party", "node_modules"})
 
@@ -71,7 +75,7 @@ class SetStatus:
 
 
 def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tuple[Target, ...]:
-    """Return the known extensions in a checkout: the folder itself, or folders up to two levels below it.
+    """Return the known extensions in a checkout: the folder itself, or folders up to `DEPTH` levels below it.
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
@@ -143,11 +147,11 @@ def pristine(data: bytes) -> bytes:
 
 
 def _subfolders(checkout: Path) -> Iterable[Path]:
-    for pattern in ("*", "*/*"):
-        for path in checkout.glob(pattern):
-            parts = path.relative_to(checkout).parts
-            if path.is_dir() and not any(part.startswith(".") or part in _SKIPPED_FOLDERS for part in parts):
-                yield path
+    for folder, names, _ in os.walk(checkout):
+        names[:] = [name for name in names if not name.startswith(".") and name not in _SKIPPED_FOLDERS]
+        yield from (Path(folder, name) for name in names)
+        if len(Path(folder).relative_to(checkout).parts) == DEPTH - 1:
+            names.clear()
 
 
 def _read(target: Target) -> dict[str, str]:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.checkouts.source import OTHERWISE, START
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
@@ -116,6 +117,14 @@ class _PointRecorder:
 
     def create_from_pcd(self, points: Any, *others: Any) -> None:
         self.points, self.others = points, others
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith(("load", "create", "restore")):
+            raise UserInputError(
+                f"the checkout's Scene makes its model by {name}(), expected {START}() of a scene's points: it trains "
+                f"on a finished model; {OTHERWISE}"
+            )
+        raise AttributeError(f"the model of a scene has no {name} before it is made of points")
 
 
 def _depths_in_view(camera: Any, points: Tensor) -> Tensor:

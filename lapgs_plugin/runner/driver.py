@@ -39,7 +39,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
-from lapgs_plugin.runner.dry_run import DryRun
+from lapgs_plugin.runner.dry_run import DryRun, undisturbed
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
@@ -98,7 +98,7 @@ class HierarchyDriver:
             device=place,
             images=SceneImages(),
             wrapper=RasterizerWrapper(parts.mark_render, EarlyVisibility() if options.run_ahead else None),
-            hooks=HookCaller(hooks),
+            hooks=HookCaller(hooks, options.hooks),
             parts=parts,
             watcher=watcher or Watcher(),
             measuring=measuring,
@@ -119,16 +119,27 @@ class HierarchyDriver:
         """
         self._since = _now_in_files()
         with (
-            Attachment(self._replacements.all()),
+            Attachment(self._replacements.in_script()),
             # Handing a backward pass to a thread of autograd's and waiting for it takes up to a tenth of an iteration.
             torch.autograd.set_multithreading_enabled(False),
             self._context.parts.watching_optimizers(),
-            counting_steps(self._adapter.profile, lambda: self._context.stage),
         ):
             self._adapter.script.run_main()
 
     def _train(self, call: TrainingCall) -> None:
         """Train the hierarchy in place of the script's call of `training`."""
+        profile = self._adapter.profile
+        if len(profile.source.models) > 1:
+            with undisturbed(self._context.device):
+                profile.choose_model(type(profile.make_model(call.values)))
+        with (
+            Attachment(self._replacements.in_training()),
+            counting_steps(profile, lambda: self._context.stage),
+        ):
+            self._train_attached(call)
+
+    def _train_attached(self, call: TrainingCall) -> None:
+        """Train the hierarchy while the checkout's symbols are replaced."""
         self._adapter.refuse(call, self._has_residuals)
         require_pruning(call, self._options.prune, self._adapter.profile.model)
         given = Path(call.dataset.model_path or _default_folder())

@@ -25,7 +25,7 @@ from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
 from lapgs_plugin.checkouts.level_views import shrunk
-from lapgs_plugin.checkouts.model_values import explain_values_beside
+from lapgs_plugin.checkouts.model_values import explain_values_beside, values_beside
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
@@ -87,7 +87,7 @@ class DryRun:
             UserInputError: the checkout cannot be trained so; the line says what failed, where, and what works.
         """
         works = NESTED_MAY_WORK if self._stage.signed else OFF
-        with _undisturbed(self._context.device), _silent_writer(self._adapter.train):
+        with undisturbed(self._context.device), _silent_writer(self._adapter.train):
             sizes = {key: level_size(self._context.images[key].size, self._stage.level) for key in self._cameras}
             rendering = StageRendering(self._stage.signed, path, self._cameras)
             if self._stage.signed:
@@ -121,18 +121,19 @@ class DryRun:
             UserInputError: it cannot; the line says what failed, where, and what works.
         """
         with (
-            _undisturbed(self._context.device),
+            undisturbed(self._context.device),
             self._step(
                 "signed colour", "negative colours of a model that has the parameters of 3DGS alone", NESTED_MAY_WORK
             ),
-            self._values_beside_explained(),
         ):
-            gaussians = self._new_model()
+            with self._step("a model of the scene's points", "one as without lapgs", OFF):
+                gaussians = self._new_model()
             self._require_parameters(gaussians)
             self._require_settable(gaussians)
             self._require_three_axes(gaussians)
-            gaussians = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
-            path = self._color_path(self._view(self._scene.train[0]), gaussians)
+            archived = self._adapter.model_of(self._call, self._adapter.snapshot(gaussians, signed=False))
+            with self._values_beside_explained(gaussians, archived):
+                path = self._color_path(self._view(self._scene.train[0]), archived)
         if path is ColorPath.PRECOMPUTED:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
         return path
@@ -142,7 +143,7 @@ class DryRun:
 
         Hooks and masks would get a map that is rasterized before the image, in the first iteration.
         """
-        with _undisturbed(self._context.device):
+        with undisturbed(self._context.device):
             try:
                 self._render(self._view(self._scene.train[0]), self._new_model())
             except Exception as error:  # the loop may do what is missing here
@@ -254,22 +255,32 @@ class DryRun:
             )
 
     @contextmanager
-    def _values_beside_explained(self) -> Iterator[None]:
-        """Name what the checkout renders besides a field's parameters as the cause of an error, if it does so."""
+    def _values_beside_explained(self, gaussians: Any, archived: Any) -> Iterator[None]:
+        """Name what a model made from a field lacks as the cause of an error, if it lacks values of each Gaussian.
+
+        Args:
+            gaussians: the checkout's model, made of points.
+            archived: one made from the field of it.
+        """
         try:
             yield
         except (LapgsError, torch.cuda.OutOfMemoryError):
             raise
         except Exception as error:
-            if why := explain_values_beside(self._adapter.profile.source, PARAMETERS):
+            source, rows, those = self._adapter.profile.source, _rows(gaussians), _rows(archived)
+            beside = [name for name, count in rows.items() if count == len(gaussians._xyz) != those.get(name)]
+            why = explain_values_beside(source, PARAMETERS) or (beside and values_beside(source.model[1], beside))
+            if why:
                 raise UserInputError(f"no residuals: {why}; {NESTED_MAY_WORK}") from error
             raise
 
     def _require_settable(self, gaussians: Any) -> None:
         """Refuse a model whose parameters are computed, which cannot start from a finished field."""
         place = self._adapter.profile.source.model[1]
-        made = {name: getattr(type(gaussians), name, None) for name in self._adapter.archived_parameters()}
-        if computed := [name for name, by in made.items() if isinstance(by, property) and by.fset is None]:
+        names = self._adapter.archived_parameters()
+        made = {name: getattr(type(gaussians), name, None) for name in names}
+        computed = [name for name, by in made.items() if isinstance(by, property) and by.fset is None]
+        if computed := computed or [name for name in names if getattr(gaussians, name).grad_fn is not None]:
             raise UserInputError(
                 f"{place}: the model computes {', '.join(computed)} of other values, expected parameters, which a "
                 f"residual's are set to; {NESTED_WORKS}"
@@ -356,6 +367,12 @@ def place_of(error: Exception, adapter: BackboneAdapter) -> str:
     return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{own[-1].lineno}"
 
 
+def _rows(gaussians: Any) -> dict[str, int]:
+    """Return the number of rows of a model's tensors by attribute."""
+    kept = (vars(gaussians), *(getattr(gaussians, name, {}) for name in ("_parameters", "_buffers")))  # of a Module
+    return {n: len(v) for values in kept for n, v in values.items() if isinstance(v, Tensor) and v.ndim}
+
+
 class _Enough(BaseException):
     """Leave the script's loop."""
 
@@ -409,16 +426,16 @@ class _Nothing:
 
 
 def _some(points: Any) -> Any:
-    """Return some of a scene's points."""
+    """Return some of a scene's points; all if it has more of them than points, such as faces."""
     count = len(points.points)
-    if count <= MOST_POINTS:
+    rows = {name: v for name, v in fields_of(points).items() if hasattr(v, "__len__") and len(v)}
+    if count <= MOST_POINTS or any(len(v) != count for v in rows.values()):
         return points
-    rows = {name: v for name, v in fields_of(points).items() if hasattr(v, "__len__") and len(v) == count}
     return with_values(points, {name: value[:: count // MOST_POINTS + 1] for name, value in rows.items()})
 
 
 @contextmanager
-def _undisturbed(device: torch.device) -> Iterator[None]:
+def undisturbed(device: torch.device) -> Iterator[None]:
     """Keep generators of random numbers, printed output and log as they are."""
     devices = [torch.cuda.current_device()] if device.type == "cuda" else []
     states = random.getstate(), np.random.get_state()

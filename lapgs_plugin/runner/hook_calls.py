@@ -21,6 +21,7 @@ from torch import Tensor
 from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks, hooks_line
+from lapgs_plugin.registry import ALL
 
 logger = logging.getLogger(__name__)
 
@@ -33,14 +34,15 @@ class HookCaller:
 
     Args:
         hooks: hooks besides those registered by entry point.
+        registered: which of those take part, as of `entry_point_hooks`.
 
     Raises:
         UserInputError: a hook is not usable.
     """
 
-    def __init__(self, hooks: Sequence[StageHook] = ()) -> None:
-        found = (*entry_point_hooks(), *hooks)
-        if (line := hooks_line()) is not None:
+    def __init__(self, hooks: Sequence[StageHook] = (), registered: str = ALL) -> None:
+        found = (*entry_point_hooks(registered), *hooks)
+        if (line := hooks_line(registered)) is not None:
             logger.info("%s", line)
         self._hooks, self._any = HookDispatcher(found), bool(found)
         self._stage: Stage | None = None

@@ -5,18 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from lapgs_plugin.adapters.registry import known_extensions
+from lapgs_plugin.checkouts.absent_modules import STOOD_IN
+from lapgs_plugin.checkouts.packages import MissingPackage, how_to_install, missing_packages, package_of
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.source import CheckoutSource
+from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
-
-DISTRIBUTIONS = {
-    "cv2": "opencv-python-headless",
-    "PIL": "pillow",
-    "skimage": "scikit-image",
-    "sklearn": "scikit-learn",
-    "yaml": "pyyaml",
-}
-"""Distributions whose names differ from those of their packages."""
 
 
 def require_matching_rasterizer(profile: Profile, title: str) -> None:
@@ -45,6 +39,27 @@ def require_matching_rasterizer(profile: Profile, title: str) -> None:
                 )
 
 
+def require_packages(source: CheckoutSource, device: str) -> None:
+    """Refuse a checkout whose packages are missing, before anything of it is executed.
+
+    Where the checkout changes the path of imports itself, only importing says what is missing.
+
+    Args:
+        source: the checkout.
+        device: as of --device.
+
+    Raises:
+        MissingExtraError: some are; the line names all of them.
+    """
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in source.modules.values())
+    if any("sys.path" in text for text in texts):
+        return
+    if missing := _missing(source, on_cpu=True):
+        without_gpu = device == "auto" and (gpus_are_hidden() or not driver_version())
+        error = ModuleNotFoundError(f"No module named '{missing[0].name}'", name=missing[0].name)
+        raise explain_import_error(error, source.script, on_cpu=device == "cpu" or without_gpu) or error
+
+
 def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> MissingExtraError | None:
     """Return an error of one line for a package that a checkout imports and that cannot be imported.
 
@@ -54,31 +69,37 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
         on_cpu: whether it runs on CPU stand-ins.
 
     Returns:
-        The error; None if the checkout does not import the package itself.
+        The error, which names all other packages that are missing, too; None if the checkout does not import the
+        package itself.
     """
-    package = _package(error.name or "")
-    purpose = next((why for name, why in known_extensions().items() if _package(name) == package), None)
+    package = package_of(error.name or "")
+    purpose = next((why for name, why in known_extensions().items() if package_of(name) == package), None)
     try:
         source = CheckoutSource.read(script)
-        imports, rasterizers, own = source.externals, source.rasterizer_modules, source.own_package(package)
     except (UserInputError, OSError):
-        imports, rasterizers, own = (), (), None
-    where = next((one.where for one in imports if _package(one.name) == package), None)
+        where, extension, own, others = None, False, None, []
+    else:
+        where = next((one.where for one in source.externals if package_of(one.name) == package), None)
+        extension = package in map(package_of, source.rasterizer_modules)
+        own = source.own_package(package)
+        others = [one for one in _missing(source, on_cpu=on_cpu) if one.name != package]
     if not package or (purpose is None and where is None):
         return None
+    missing = MissingPackage(package, where or str(script), own, extension or purpose is not None)
     named = f", the {purpose}" if purpose else ""
-    problem = f"{where or script} needs {package}{named}, which cannot be imported ({first_line(error)})"
-    ours = purpose is not None or package in map(_package, rasterizers)
-    if on_cpu and (ours or (own is not None and own.needs_cuda)):
-        return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA")
-    if not ours:
-        install = f"pip install {DISTRIBUTIONS.get(package, package)}" if own is None else own.install
-        return MissingExtraError(f"{problem}: {install}")
-    how = "install it as the checkout's README says" if own is None else own.install
+    problem = f"{missing.where} needs {package}{named}, which cannot be imported ({first_line(error)})"
+    also = f"; not installed either: {how_to_install(others)}" if others else ""
+    if on_cpu and (missing.extension or (own is not None and own.needs_cuda)):
+        return MissingExtraError(f"{problem}: no CPU stand-in has what the checkout takes from it; it needs CUDA{also}")
+    if not missing.extension:
+        return MissingExtraError(f"{problem}: {missing.install}{also}")
     return MissingExtraError(
-        f"{problem}; {how}, or run on CPU stand-ins with `lapgs run --device cpu`, if `lapgs doctor CHECKOUT` finds one"
+        f"{problem}; {missing.install}, or run on CPU stand-ins with `lapgs run --device cpu`, if `lapgs doctor "
+        f"CHECKOUT` finds one{also}"
     )
 
 
-def _package(module: str) -> str:
-    return module.partition(".")[0]
+def _missing(source: CheckoutSource, *, on_cpu: bool) -> list[MissingPackage]:
+    """Return packages that are not installed, on a CPU without those that have stand-ins."""
+    missing = missing_packages(source, known_extensions())
+    return [one for one in missing if not (on_cpu and (one.extension or one.name in STOOD_IN))]

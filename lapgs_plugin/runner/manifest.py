@@ -144,6 +144,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
         "hierarchy": residuals,
         "protocol": "default",
         "prune": 0.0,
+        "hooks": "all",
         "residual_threshold": 1.0,
         "residual_resets": settings.get("hierarchy", residuals) == residuals,
         "sh_rate": 1.0,

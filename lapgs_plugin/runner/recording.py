@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ class BareRunRecorder:
         self._scene: Any = None
         self.record = LoopRecord(self._device)
         self._timeline: list[dict[str, float]] = []
+        self._timing = ExitStack()  # begins when the scene has a model, whose class is known then
 
     def run(self) -> None:
         """Run the main block and write `BARE_RECORD`.
@@ -64,7 +66,7 @@ class BareRunRecorder:
             UserInputError: the script never trained.
             RunFolderError: its output folder holds a run in levels.
         """
-        with Attachment(self._replacements()), counting_steps(self._adapter.profile, lambda: self):
+        with Attachment(self._replacements()), self._timing:
             self._adapter.script.run_main()
         if self._call is None or self.iteration == 0:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
@@ -84,7 +86,6 @@ class BareRunRecorder:
             *sharing_ports(profile),
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
-            *timing_replacements(profile, lambda: self),
         ]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -105,6 +106,11 @@ class BareRunRecorder:
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_scene(*args: Any, **kwargs: Any) -> Any:
             self._scene = original(*args, **kwargs)
+            profile = self._adapter.profile
+            profile.choose_model(type(self.gaussians))
+            self._timing.close()
+            self._timing.enter_context(Attachment(timing_replacements(profile, lambda: self)))
+            self._timing.enter_context(counting_steps(profile, lambda: self))
             return self._scene
 
         return make_scene

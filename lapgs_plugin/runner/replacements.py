@@ -43,18 +43,30 @@ class StageReplacements:
         self._context, self._train = context, train
         self._controlling = False  # whether a method of density control is running
 
-    def all(self) -> list[Replacement]:
-        """Return the replacements in the order in which they are made.
+    def in_script(self) -> list[Replacement]:
+        """Return the replacements for the script's main block, in the order in which they are made.
 
         Raises:
             UserInputError: this is no 3DGS checkout, or another rasterizer than its own is installed.
         """
-        adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
-        require_matching_rasterizer(profile, adapter.info.title)
+        profile = self._context.adapter.profile
+        require_matching_rasterizer(profile, self._context.adapter.info.title)
         return [
             writing_whole_files(),
             *sharing_ports(profile),
-            *self._in_training(profile),
+            Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
+        ]
+
+    def in_training(self) -> list[Replacement]:
+        """Return the further replacements for a call of the script's `training`, when the class of its model is known.
+
+        Raises:
+            UserInputError: an option has nothing to act on.
+        """
+        adapter, parts, profile = self._context.adapter, self._context.parts, self._context.adapter.profile
+        scenes = profile.script_names(profile.scene)
+        return [
+            *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
             *(
                 Replacement(camera, "__init__", self._context.images.adopting, "the scene's loader, for every image")
                 for camera in profile.cameras
@@ -75,13 +87,6 @@ class StageReplacements:
     def _in_residual(self) -> bool:
         stage = self._running()
         return stage is not None and stage.stage.signed
-
-    def _in_training(self, profile: Profile) -> list[Replacement]:
-        scenes = profile.script_names(profile.scene)
-        return [
-            Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
-            *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
-        ]
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
         control = dict.fromkeys(profile.density_control, self._make_density_control)

@@ -69,7 +69,7 @@ def require_room(path: Path | str, overwrite: bool = False, since: int | None = 
         if folder.exists() and not folder.is_dir():
             raise RunFolderError(f"{folder} is a file, expected a folder for the run; choose another name")
     if is_run(folder):
-        if not overwrite:
+        if not overwrite and has_begun(folder):
             raise RunFolderError(
                 f"{folder} already holds a run; continue it with --resume (`lapgs train`, `lapgs run`) or replace "
                 "it with --overwrite"
@@ -127,6 +127,21 @@ def is_run(folder: Path) -> bool:
         except UserInputError:
             return (folder / HISTORY).is_file()
     return "lapgs_plugin" in str(values.get("created_by"))
+
+
+def has_begun(folder: Path) -> bool:
+    """Return whether a run has trained: has a finished level, a checkpoint or a history, or cannot be read.
+
+    One that failed before its first iteration has none, and its folder can be taken again.
+    """
+    with one_line_errors(folder, "read"):
+        history = folder / HISTORY
+        if (folder / CHECKPOINT).exists() or (history.exists() and history.stat().st_size):
+            return True
+        try:
+            return bool(read_json(folder / MANIFEST, dict[str, Any]).get("records"))
+        except UserInputError:
+            return True
 
 
 def remove_results(folder: Path) -> None:

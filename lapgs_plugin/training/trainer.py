@@ -116,7 +116,9 @@ class Trainer:
                     "--gpu-busy: is measured in whole stages, not when a run is extended; leave it out"
                 )
         self._quality = QualityWatch()
-        self._hooks = HookDispatcher.create(self._context.supervision, self.settings.ssim_weight, self.user_hooks)
+        self._hooks = HookDispatcher.create(
+            self._context.supervision, self.settings.ssim_weight, self.user_hooks, self.settings.hooks
+        )
 
     def run(self, resume: bool = False) -> None:
         """Train all stages that are not finished yet, or extend a finished run.
@@ -153,7 +155,7 @@ class Trainer:
         """Tell the user what the settings mean for this scene and device."""
         scene, say = self._context.scene, self.monitor.say
         say(self._strategy_line())
-        if (hooks := hooks_line()) is not None:
+        if (hooks := hooks_line(self.settings.hooks)) is not None:
             say(hooks)
         if (few := few_views_line(len(scene.train), self._context.plan.iterations, bool(scene.test))) is not None:
             say(few)

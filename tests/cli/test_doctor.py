@@ -17,8 +17,8 @@ from lapgs_plugin.cli.doctor import current_folder, doctor, examine
 from lapgs_plugin.environment import findings, probes
 from lapgs_plugin.environment.probes import Probe
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.hooks import ENTRY_POINT_GROUP
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
+from lapgs_plugin.registry import HOOKS
 from lapgs_plugin.training.strategies import STRATEGIES
 from tests.contract.stub_runs import CHECKOUTS
 from tests.plugin_package import install_package
@@ -63,7 +63,7 @@ def test_entry_points_of_packages_are_listed_and_misspelt_groups_found(
     assert found["opaque"].status == "problem"
     assert "lapgs_plugin.strategy, which nothing reads" in found["opaque"].detail
     registries = (SUPERVISIONS, BACKBONES, STRATEGIES, RASTERIZERS)
-    assert {*(each.group for each in registries), ENTRY_POINT_GROUP} == set(findings.ENTRY_POINT_GROUPS)
+    assert {*(each.group for each in registries), HOOKS} == set(findings.ENTRY_POINT_GROUPS)
 
 
 def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -332,6 +332,14 @@ def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
     assert {level: archive.field_path(level).read_bytes() for level in (1, 0)} == before
 
 
+def test_a_run_that_failed_before_its_first_iteration_does_not_block_its_folder(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, hooks=[StopAt(1)])
+    assert (tmp_path / "run" / "manifest.json").exists()
+    archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT)
+    assert archive.available_levels == (1, 0)
+
+
 def test_a_folder_of_the_backbone_itself_is_not_written_over(scene: Path, tmp_path: Path) -> None:
     run_bare(STUBS["graphdeco"], scene, tmp_path / "run", "--iterations", 2)
     with pytest.raises(RunFolderError, match="is not empty and not a run"):

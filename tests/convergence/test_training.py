@@ -400,7 +400,7 @@ def test_a_hook_by_entry_point_is_one_object_in_all_levels(
         def on_stage_start(self, stage: Stage) -> None:
             calls.append((self, stage.level))
 
-    monkeypatch.setattr(hooks, "entry_point_hooks", lambda: (Noting(),))
+    monkeypatch.setattr(hooks, "entry_point_hooks", lambda _: (Noting(),))
     train(tmp_path / "run", scene, replace(SETTINGS, iterations=24))
     assert [level for _, level in calls] == [1, 0]
     assert len({id(hook) for hook, _ in calls}) == 1

@@ -167,6 +167,27 @@ def test_an_existing_run_is_refused_and_unharmed(tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
 
 
+@pytest.mark.parametrize("has", ["nothing", "history", "checkpoint", "damaged manifest"])
+def test_a_run_that_failed_before_its_first_iteration_does_not_block_its_folder(has: str, tmp_path: Path) -> None:
+    with RunArchive.create(tmp_path, manifest()) as archive:
+        if has == "history":
+            archive.append_history({"level": 1, "iteration": 1})
+        elif has == "checkpoint":
+            archive.save_checkpoint({"level": 1})
+        elif has == "nothing":
+            with pytest.raises(RunFolderError, match="is being written by process"):  # it may be about to begin
+                RunArchive.create(tmp_path, manifest())
+    if has == "nothing":
+        RunArchive.create(tmp_path, manifest()).close()
+        return
+    if has == "damaged manifest":
+        (tmp_path / MANIFEST).write_text('{"created_by": "lapgs_plugin", "records": [')
+    before = snapshot(tmp_path)
+    with pytest.raises(RunFolderError):
+        RunArchive.create(tmp_path, manifest())
+    assert snapshot(tmp_path) == before
+
+
 def test_overwrite_removes_only_files_of_a_run(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path, manifest()) as archive:
         archive.finish_level(record(1), level_field(1), {"x": 1})

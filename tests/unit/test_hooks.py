@@ -26,10 +26,14 @@ from lapgs_plugin.hooks import (
     StageHook,
     SupervisionLoss,
     entry_point_hooks,
+    hooks_line,
     verify_hook,
 )
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import OracleRasterizer
+from lapgs_plugin.runner.hook_calls import HookCaller
+from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.training.settings import TrainSettings
 
 BASE = Stage(level=1, image_size=(16, 12), iterations=5, signed=False)
 RESIDUAL = Stage(level=0, image_size=(32, 24), iterations=9, signed=True)
@@ -113,7 +117,7 @@ def register(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
     def find(*, group: str, _entries: list[EntryPoint] = group) -> list[EntryPoint]:
         return [entry for entry in _entries if entry.group == group]
 
-    monkeypatch.setattr(hooks_module, "entry_points", find)
+    monkeypatch.setattr("importlib.metadata.entry_points", find)
 
 
 def test_the_order_of_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,6 +352,31 @@ def test_entry_points_that_cannot_be_used_are_named(monkeypatch: pytest.MonkeyPa
     with pytest.raises(UserInputError, match=f"hook entry point fancy .{value}.") as caught:
         entry_point_hooks()
     assert caught.match(message)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "names"),
+    [("all", ["a", "b"]), ("none", []), ("b", ["b"]), ("b, a", ["a", "b"])],
+)
+def test_installed_hooks_are_chosen(monkeypatch: pytest.MonkeyPatch, chosen: str, names: list[str]) -> None:
+    """By `lapgs train`, by `lapgs run`, and in the options of an experiment's variants."""
+    register(monkeypatch, b=f"{__name__}:ByEntryPointB", a=f"{__name__}:ByEntryPointA")
+    for settings in (TrainSettings(hooks=chosen), RunSettings(hooks=chosen)):
+        dispatcher = HookDispatcher.create(SUPERVISIONS["reconstructed"], registered=settings.hooks)
+        assert dispatcher.is_plain(BASE) == (not names)
+        dispatcher.on_stage_start(BASE)
+        assert [call.split()[1] for call in CALLS] == names
+        CALLS.clear()
+        assert bool(HookCaller(registered=settings.hooks)) == bool(names)
+        assert (hooks_line(settings.hooks) is None) == (not names)
+
+
+def test_hooks_that_nobody_registers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    register(monkeypatch, fancy=f"{__name__}:ByEntryPointA")
+    for kind in (TrainSettings, RunSettings):
+        with pytest.raises(UserInputError, match=r"--hooks fancy,plain: .* 'plain'; expected all, none, fancy") as e:
+            kind(hooks="fancy,plain")
+        assert "\n" not in str(e.value)
 
 
 def test_an_installed_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,7 @@ from lapgs_plugin.patching.files import read_only, uncommitted, write_all
 from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recipes
 from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
+from tests.contract.stub_runs import CHECKOUTS
 from tests.folders import snapshot
 
 # An anchor is written between [name and name], so that its index among the tokens is known.
@@ -861,7 +862,7 @@ def test_a_header_included_twice_by_an_earlier_version_is_taken_out(rasterizer: 
     assert apply(target, "build-cuda13") == before
 
 
-@pytest.mark.parametrize("depth", [0, 1, 2])
+@pytest.mark.parametrize("depth", [0, 1, 2, 3])  # as of a checkout in a checkout, which doctor finds, too
 def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, depth: int) -> None:
     checkout = [rasterizer, *rasterizer.parents][depth]
     (found,) = find_targets(checkout)
@@ -962,6 +963,15 @@ def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     lapgs_patch("revert", checkout)
     assert snapshot(checkout) == pristine
     assert "nothing to remove" in lapgs_patch("revert", checkout)
+
+
+@pytest.mark.parametrize("inside", ["ms/train.py", "ms"])
+def test_a_training_script_stands_for_its_checkout(rasterizer: Path, inside: str) -> None:
+    """As for `lapgs doctor`."""
+    checkout = rasterizer.parents[1]
+    shutil.copytree(CHECKOUTS / "mini", checkout, dirs_exist_ok=True)
+    assert str(rasterizer) in lapgs_patch("status", checkout / inside)
+    assert "--- a/submodules/diff-gaussian-rasterization/" in lapgs_patch("diff", checkout / inside)
 
 
 def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import re
+import sys
 import time
 
 import pytest
 from rich.console import Console
 from rich.progress import TextColumn
+from tqdm import tqdm
 
 from lapgs_plugin import progress
+from lapgs_plugin.jit.notice import say_compiling
 from lapgs_plugin.progress import LoggingProgress
 from lapgs_plugin.training.monitor import ProgressMonitor
 
@@ -72,3 +76,15 @@ def test_tracked_work_without_a_terminal_is_counted_to_its_end() -> None:
             time.sleep(0.15)  # longer than rich waits between two refreshes
     (line,) = shown.getvalue().splitlines()
     assert line.startswith("Rendering 2 of 2 views (100 %) ")
+
+
+def test_a_scripts_bar_does_not_hide_what_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its first iteration compiles our kernels, also with --off: the bar stands at 0 meanwhile."""
+    shown = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", shown)
+    say_compiling.cache_clear()
+    with tqdm(total=150, desc="Training progress", file=shown):
+        say_compiling("CPU")
+        say_compiling("CPU")
+    lines = [line for line in re.split(r"[\r\n]", shown.getvalue()) if "compiling" in line]
+    assert lines == ["compiling CPU kernels, which may take a minute; later runs load them from a cache ..."]
