@@ -43,6 +43,16 @@ def as_pip_argument(folder: Path) -> str:
     return shlex.quote(os.path.join(".", folder))  # noqa: PTH118
 
 
+def shipped(name: str) -> Path:
+    """Return a folder that comes with the package: inside it where it is installed, else at the top of the repository.
+
+    Args:
+        name: "docs" or "patches", see `setup.py`.
+    """
+    installed = Path(__file__).parent / name
+    return installed if installed.is_dir() else Path(__file__).parents[1] / name
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`, and rename it to `path` when the block ends without an error.

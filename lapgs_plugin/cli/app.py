@@ -17,6 +17,7 @@ from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.export import export
+from lapgs_plugin.cli.help import show_topic
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
@@ -76,7 +77,7 @@ def options(
 
     Get a scene with `lapgs sample` or `lapgs prepare`. Train it with `lapgs train`, or with the train.py of a checkout
     through `lapgs run`. Then use `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` on the run folder.
-    `lapgs doctor` checks this machine.
+    `lapgs doctor` checks this machine. `lapgs help` has the documentation.
     """
 
 
@@ -94,6 +95,7 @@ app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)
 app.add_typer(patch.app, name="patch")
 app.command("doctor")(doctor)
+app.command("help")(show_topic)
 
 
 def _flowing_help(group: typer.Typer) -> None:

@@ -26,6 +26,7 @@ from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.schema import Experiment, load_experiment
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
+from lapgs_plugin.experiments.standard import experiment_file
 from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
 from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
@@ -47,7 +48,8 @@ class RunsFailedError(LapgsError):
 
 
 def run_experiment(file: Path, settings: BenchSettings) -> None:
-    """Do what `lapgs bench EXPERIMENT.toml` says in its help."""
+    """Do what `lapgs bench EXPERIMENT` says in its help."""
+    file = experiment_file(file)
     experiment = load_experiment(file, _option_names())
     mistakes = Mistakes(file, experiment, settings.selection)
     with mistakes.at("table"):

@@ -28,7 +28,7 @@ SetName = Annotated[
         "--set",
         help="Edits to apply: signed-color (native rendering of residual fields), build-cuda13 (build with CUDA 12.8 "
         "to 13), or all for both. gradient-fixes and robustness, for some rasterizers, mend faults of ordinary "
-        "training and are not part of all. See docs/rasterizers.md.",
+        "training and are not part of all. See `lapgs help rasterizers`.",
     ),
 ]
 AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files with uncommitted changes.")]
