@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from lapgs_plugin import __version__, interrupt
 from lapgs_plugin.cli import patch
 from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.cli.config_file import naming_the_config
 from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
@@ -43,7 +44,7 @@ class Commands(TyperGroup):
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
-        with interrupt.command(), one_line_usage_errors(ctx):
+        with interrupt.command(), naming_the_config(ctx.meta), one_line_usage_errors(ctx):
             return super().invoke(ctx)
 
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from lapgs_plugin import __version__
 from lapgs_plugin.cli.bench_check import READS_SCENES, check_runs
-from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.cli.run import run as run_script
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
@@ -31,6 +31,7 @@ from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultSto
 from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
+from lapgs_plugin.runs.layout import require_place
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "eval", "seed", "rasterizer", "resume", "overwrite"),

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
+from lapgs_plugin.runs.layout import require_place
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField

@@ -1,4 +1,4 @@
-"""Print tables and logs, name the command that comes next, and check where results go."""
+"""Print tables and logs, and name the command that comes next."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ import os
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.files import is_folder
-from lapgs_plugin.limits import LONGEST_NAME
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -51,21 +47,3 @@ def train_command(scene: Path, options: str = "") -> str:
     """Return the command that trains a scene with further options, as a user can paste it."""
     run = Path("runs") / scene.absolute().name
     return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval {options}".rstrip()
-
-
-def require_place(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written, before the work whose result it is for. Writes nothing.
-
-    Raises:
-        UserInputError: it is a file or below one, or it is not writable.
-    """
-    existing = str(folder)
-    # Not Path.exists, which raises where a name is too long for the file system.
-    while not os.path.lexists(existing):
-        if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
-            raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
-        existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
-    if not is_folder(Path(existing)):
-        raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")

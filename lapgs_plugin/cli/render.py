@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table, require_place, show_log
+from lapgs_plugin.cli.output import make_console, make_table, show_log
 from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
 from lapgs_plugin.rendering.options import RenderOptions
+from lapgs_plugin.runs.layout import require_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,6 +13,7 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.environment import PACKAGE, run_program
@@ -77,7 +78,7 @@ def _extensions_folder() -> str:
 
     python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"
     platform = f"cu{torch.version.cuda.replace('.', '')}" if torch.version.cuda else "cpu"
-    return os.environ.get("TORCH_EXTENSIONS_DIR") or os.path.join(get_default_build_root(), f"{python}_{platform}")
+    return os.environ.get("TORCH_EXTENSIONS_DIR") or str(Path(get_default_build_root(), f"{python}_{platform}"))
 
 
 def _probe_rasterizer() -> dict[str, Any]:

@@ -50,7 +50,7 @@ from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import CACHE
+from lapgs_plugin.runs.layout import CACHE, require_place
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
@@ -134,6 +134,7 @@ class HierarchyDriver:
         folder, source = given.absolute(), Path(call.dataset.source_path)
         if not self._resume:
             RunArchive.require_room(given, self._overwrite, self._since)
+            require_place(given, "-m")
         if not source.exists():
             raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
@@ -234,6 +235,8 @@ class HierarchyDriver:
         archive = RunArchive.open(folder, resume=True)
         try:
             require_same_run(archive.manifest, manifest)
+            if archive.manifest.complete:
+                logger.info("the run in %s is finished: nothing is left to train", folder)
         except BaseException:
             archive.close()
             raise

@@ -77,6 +77,7 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
         ("train empty -o runs/desk", "empty: neither a COLMAP model "),
         ("train desk -o full", "full is not empty and not a run "),
         ("train desk -o full/train.py/x", "--out full/train.py/x: full/train.py is a file; "),
+        ("train desk -o /proc/run", "--out /proc/run"),
         ("run --device cpu full/train.py", "full/train.py is not the training script "),
         ("eval runs/desk", "runs/desk does not exist, "),
         ("render empty", "empty has no manifest.json, "),

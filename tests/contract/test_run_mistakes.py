@@ -320,6 +320,12 @@ def test_a_hierarchy_that_does_not_fit_the_scene(scene: Path, tmp_path: Path) ->
     one_line(caught.value)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a folder in /proc cannot be made")
+def test_an_output_folder_that_cannot_be_made_is_refused_before_the_photos_are_read(scene: Path) -> None:
+    with pytest.raises(UserInputError, match=r"^-m /proc/run"):
+        run_hierarchy(STUBS["graphdeco"], scene / "gone", Path("/proc/run"), *SHORT)
+
+
 def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *SHORT)
