@@ -100,9 +100,7 @@ def test_a_settings_file_that_is_no_text_is_refused_before_a_run_is_extended(sce
     (run / "run.toml").write_bytes(b"iterations = 8\n#\xff\n")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     extend = ("train", scene, "-o", run, "--resume", "--iterations", 11)
-    with pytest.raises(
-        RunFolderError, match=r"run\.toml is not readable: byte 16 .* expected UTF-8 .* delete it"
-    ):
+    with pytest.raises(RunFolderError, match=r"run\.toml is not readable: byte 16 .* expected UTF-8 .* delete it"):
         lapgs(*extend)
     assert {path: path.read_bytes() for path in before} == before
     (run / "run.toml").unlink()  # as the message advises
