@@ -149,7 +149,7 @@ def write_text(path: Path, text: str, *, training: bool = False) -> None:
         RunFolderError: see `one_line_errors`.
     """
     with one_line_errors(path, training=training), atomic_write(path) as stream:
-        stream.write(text.encode())
+        stream.write(text.encode(errors="backslashreplace"))  # names that are no UTF-8
 
 
 def is_file(path: Path) -> bool:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from lapgs_plugin.errors import printable_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,12 +24,32 @@ def make_console(*, stderr: bool = False) -> Console:
 
     The environment variable COLUMNS sets the width of either.
     """
-    from rich.console import Console
+    from lapgs_plugin.progress import EscapingConsole
 
-    made = Console(stderr=stderr, highlight=False)
-    if not made.is_terminal and not os.environ.get("COLUMNS", "").isdecimal():
-        made.width = UNLIMITED
-    return made
+    console = EscapingConsole(stderr=stderr, highlight=False)
+    if not console.is_terminal and not os.environ.get("COLUMNS", "").isdecimal():
+        console.width = UNLIMITED
+    return console
+
+
+def say(text: str, *, stderr: bool = False) -> None:
+    """Print lines at once, with control characters of names as escapes."""
+    print(printable_lines(text), file=sys.stderr if stderr else sys.stdout, flush=True)
+
+
+class _EscapingFormatter(logging.Formatter):
+    """Show control characters of names as escapes in messages of this package."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return printable_lines(text) if record.name.startswith("lapgs_plugin") else text
+
+
+def log_to_stderr(pattern: str = "lapgs: %(message)s") -> None:
+    """Print log records on stderr, unless the program set up logging before."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(_EscapingFormatter(pattern))
+    logging.basicConfig(handlers=[handler])
 
 
 def make_table(*headings: str) -> Table:
@@ -39,7 +62,7 @@ def make_table(*headings: str) -> Table:
 
 def show_log() -> None:
     """Print on stderr which rasterizer renders a run, and why."""
-    logging.basicConfig(format="lapgs: %(message)s")
+    log_to_stderr()
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.INFO)
 
 

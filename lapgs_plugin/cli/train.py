@@ -13,7 +13,7 @@ import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.config_file import ConfigOption, extended_config, write_config
-from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.cli.output import log_to_stderr, make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
@@ -98,6 +98,7 @@ def train(
     """
     from lapgs_plugin.scenes.masks import resolve_masks
 
+    log_to_stderr("%(message)s")
     watcher = context.with_resource(watching(start.viewing, out.absolute().name))
     reference = _reference(scene, photos)
     if isinstance(context.obj, Rehearsal):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from rich.table import Table
+from typer.testing import CliRunner
 
 from lapgs_plugin.cli import prepare
 from lapgs_plugin.cli.app import app
@@ -14,6 +16,7 @@ from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.training import backend
 from tests.cli.commands import succeeding
+from tests.cli.run_folder import write_run, write_scene
 
 WORDS = "word " * 40 + "end"
 
@@ -93,3 +96,30 @@ def test_messages_name_folders_as_they_were_typed(
     Path("full/train.py").write_text("import json\n")
     with pytest.raises(UserInputError, match=f"^{message}"):
         succeeding(app, 120)(*words.split())
+
+
+ODD = "r\x1b]0;title\x07\udcff[b]"
+"""A name with a control sequence, a byte that is no UTF-8, and markup of rich."""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "eval",
+        "export",
+        "export --html",
+        "render",
+        "report",
+        "report --baseline {run}",
+        "train {scene} --iterations 2 --levels 1 --overwrite -o",
+    ],
+)
+def test_names_reach_the_terminal_as_escapes_on_success_too(command: str, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "s\x1b[31m")
+    run = write_run(tmp_path / ODD, scene, levels=1)
+    name, *options = (word.format(run=run, scene=scene) for word in command.split(" "))
+    words = [name, str(run), *options] if name != "train" else [name, *options, str(run)]
+    result = CliRunner(charset="utf-8").invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert r"r\x1b]0;title\x07\udcff[b]" in result.output.replace("\n", "")
+    assert not re.search("[\x00-\x09\x0b-\x1f\udcff]", result.output)
