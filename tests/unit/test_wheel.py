@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from lapgs_plugin.cli.help import topics
+from tests.package_strings import ROOT, said
 
-ROOT = Path(__file__).parents[2]
 BUILD = """
 import sys
 from setuptools import setup  # replaces distutils
@@ -54,19 +52,6 @@ def test_a_wheel_has_every_file_of_the_package(site: Path) -> None:
     own = {path for path in (ROOT / "lapgs_plugin").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
     lacking = {str(path.relative_to(ROOT)) for path in own if not (site / path.relative_to(ROOT)).is_file()}
     assert lacking == {"lapgs_plugin/README.md"}  # the map of the code, for its developers
-
-
-def said() -> Iterator[tuple[str, str]]:
-    """Yield the strings of the package with their places; of its docstrings those of commands, which --help prints."""
-    for path in sorted((ROOT / "lapgs_plugin").rglob("*.py")):
-        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        printed = {
-            id(node.body[0]) for node in nodes if isinstance(node, ast.FunctionDef) and path.parent.name == "cli"
-        }
-        silent = {id(node.value) for node in nodes if isinstance(node, ast.Expr) and id(node) not in printed}
-        for node in nodes:
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in silent:
-                yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
 
 
 def test_messages_name_pages_that_exist() -> None:
