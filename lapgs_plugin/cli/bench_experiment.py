@@ -69,6 +69,10 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
         _write(experiment, planned, folder)
         return
     if not settings.dry_run:
+        try:
+            str(folder.absolute()).encode()
+        except UnicodeEncodeError as error:
+            raise UserInputError(f"--out {folder}: not UTF-8, which the store needs; choose another folder") from error
         check_launcher(settings.engine)
         require_place(folder)
     scenes, places = scenes_of(experiment, settings.selection), Locations(settings.folders, file.parent)

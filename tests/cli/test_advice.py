@@ -119,6 +119,11 @@ ADVICE = [
         "give .*--path garden=FOLDER",
         ["bench {experiment} --dry-run --no-eval --path garden={scene}"],
     ),
+    (
+        "bench smoke --no-eval --out {tmp}/\udcff",
+        "not UTF-8, which the store needs; choose another folder",
+        ["bench smoke --no-eval --out {tmp}/x --dry-run"],
+    ),
     ("patch apply {scene}", "`lapgs help patches` says how to add one", ["help patches"]),
     ("help train", r"did you mean training\?", ["help training"]),
 ]

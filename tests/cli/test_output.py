@@ -14,6 +14,7 @@ from lapgs_plugin.cli import prepare
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.training import backend
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
@@ -122,4 +123,5 @@ def test_names_reach_the_terminal_as_escapes_on_success_too(command: str, tmp_pa
     result = CliRunner(charset="utf-8").invoke(app, words)
     assert result.exit_code == 0, result.output
     assert r"r\x1b]0;title\x07\udcff[b]" in result.output.replace("\n", "")
+    assert RunArchive.open(run).name == r"r\x1b]0;title\x07\udcff[b]"  # on pages, too
     assert not re.search("[\x00-\x09\x0b-\x1f\udcff]", result.output)
