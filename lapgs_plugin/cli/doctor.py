@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,7 +15,7 @@ from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from concurrent.futures import Executor, Future
 
     from lapgs_plugin.environment.findings import Finding
     from lapgs_plugin.environment.probes import Probe
@@ -78,7 +78,8 @@ def examine() -> dict[str, list[Finding]]:
         driver = pool.submit(driver_version)
         imports = {name: pool.submit(run_probe, "import", name) for name in IMPORTED}
         extensions = [pool.submit(findings.extension_finding, *known) for known in modules.items()]
-        wait([torch_probe, raster_probe, driver, *imports.values(), *extensions])
+        everything: list[Future[Any]] = [torch_probe, raster_probe, driver, *imports.values(), *extensions]
+        wait(everything)
     torch = torch_probe.result()
     compilers = findings.compiler_findings(torch.facts.get("cuda"))
     sections = {
