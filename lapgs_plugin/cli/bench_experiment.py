@@ -38,7 +38,7 @@ from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultSto
 from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.runs.layout import require_place
+from lapgs_plugin.runs.layout import require_place, require_utf8
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "eval", "seed", "rasterizer", "resume", "overwrite"),
@@ -69,10 +69,7 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
         _write(experiment, planned, folder)
         return
     if not settings.dry_run:
-        try:
-            str(folder.absolute()).encode()
-        except UnicodeEncodeError as error:
-            raise UserInputError(f"--out {folder}: not UTF-8, which the store needs; choose another folder") from error
+        require_utf8(folder, "--out")
         check_launcher(settings.engine)
         require_place(folder)
     scenes, places = scenes_of(experiment, settings.selection), Locations(settings.folders, file.parent)

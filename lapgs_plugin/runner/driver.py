@@ -50,7 +50,7 @@ from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import CACHE, require_place
+from lapgs_plugin.runs.layout import CACHE, require_place, require_utf8
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
@@ -135,6 +135,7 @@ class HierarchyDriver:
         if not self._resume:
             RunArchive.require_room(given, self._overwrite, self._since)
             require_place(given, "-m")
+            require_utf8(given, "-m")
         if not source.exists():
             raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
         with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:

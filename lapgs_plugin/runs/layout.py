@@ -113,6 +113,18 @@ def require_place(folder: Path, option: str = "--out") -> None:
                 path.rmdir()
 
 
+def require_utf8(folder: Path, option: str) -> None:
+    """Refuse a folder whose path cannot be kept in JSON.
+
+    Raises:
+        UserInputError: as `require_place`.
+    """
+    try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise UserInputError(f"{option} {folder}: not UTF-8, as paths are kept; choose another folder") from error
+
+
 def _oldest(path: Path) -> int:
     """Return when a file, or the oldest file in a folder, was last written, in nanoseconds."""
     return min(each.lstat().st_mtime_ns for each in (path, *path.rglob("*")))

@@ -121,7 +121,7 @@ ADVICE = [
     ),
     (
         "bench smoke --no-eval --out {tmp}/\udcff",
-        "not UTF-8, which the store needs; choose another folder",
+        "not UTF-8, as paths are kept; choose another folder",
         ["bench smoke --no-eval --out {tmp}/x --dry-run"],
     ),
     ("patch apply {scene}", "`lapgs help patches` says how to add one", ["help patches"]),

@@ -321,9 +321,16 @@ def test_a_hierarchy_that_does_not_fit_the_scene(scene: Path, tmp_path: Path) ->
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a folder in /proc cannot be made")
-def test_an_output_folder_that_cannot_be_made_is_refused_before_the_photos_are_read(scene: Path) -> None:
-    with pytest.raises(UserInputError, match=r"^-m /proc/run"):
-        run_hierarchy(STUBS["graphdeco"], scene / "gone", Path("/proc/run"), *SHORT)
+@pytest.mark.parametrize(
+    ("folder", "message"), [("/proc/run", "^-m /proc/run"), ("r\udcff", r"^-m r\\udcff: not UTF-8")]
+)
+def test_an_output_folder_that_cannot_be_used_is_refused_before_the_photos_are_read(
+    folder: str, message: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserInputError, match=message):
+        run_hierarchy(STUBS["graphdeco"], scene / "gone", Path(folder), *SHORT)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
