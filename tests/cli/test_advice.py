@@ -49,6 +49,23 @@ ADVICE = [
         [f"{TRAIN} --split 1/1000,999/1000 --iterations 2000", f"{TRAIN} --split 1/2,1/2 --overwrite"],
     ),
     (f"{TRAIN} --strategy 3dgs --cap-max 9", "leave it out", [f"{TRAIN} --strategy 3dgs"]),
+    (
+        f"{TRAIN} --hierarchy nested --joint 0.2",
+        "leave it out, or add --hierarchy laplacian",
+        [f"{TRAIN} --hierarchy nested", f"{TRAIN} --hierarchy laplacian --joint 0.2 --overwrite"],
+    ),
+    (
+        f"{TRAIN} --protocol paper --joint 0.3",
+        "leave one out",
+        [f"{TRAIN} --protocol paper", f"{TRAIN} --joint 0.3 --overwrite"],
+    ),
+    (
+        f"{TRAIN} --views-per-step 99",
+        "the scene has 10 training views; give at most as many, or auto",
+        [f"{TRAIN} --views-per-step 10", f"{TRAIN} --views-per-step auto --overwrite"],
+    ),
+    (f"{TRAIN} --images-on gpu", "expected memory or disk", [f"{TRAIN} --images-on disk"]),
+    *((f"{TRAIN} {option}", "leave it out", [TRAIN]) for option in ("--keep best", "--packed", "--gpu-busy")),
     (f"{TRAIN} --resume --overwrite", "give one of them", [f"{TRAIN} --overwrite", f"{TRAIN} --resume"]),
     (f"{TRAIN} --resume", "leave --resume out to start one", [TRAIN]),
     (
@@ -102,8 +119,21 @@ ADVICE = [
     ("report {run} {all_trained}", "lapgs report RUN --baseline OTHER", ["report {run} --baseline {all_trained}"]),
     ("report {odd_metrics}", "write it again with `lapgs eval`", ["eval {odd_metrics}", "report {odd_metrics}"]),
     ("report {odd_history}", "delete that line", ["cut {odd_history}/history.jsonl", "report {odd_history}"]),
-    ("run --record {script}", "leave it out", ["run --off {script}"]),
-    ("run --off --levels 2 {script}", "leave it out", ["run --off {script}"]),
+    (
+        "report",
+        "name one, or train one with `lapgs train SCENE -o runs/NAME`",
+        ["report {run}", "train {scene} -o runs/one --rasterizer cpu"],
+    ),
+    ("render {run} --frame-rate 5", "leave it out", ["render {run}"]),
+    ("render {run} --views some", "expected test, train or all", ["render {run} --views all"]),
+    (
+        "sample {scene} --size 32x24 --views 3 --points 9",
+        "choose another or replace it with --overwrite",
+        [
+            "sample {new} --size 32x24 --views 3 --points 9",
+            "sample {new} --size 32x24 --views 3 --points 9 --overwrite",
+        ],
+    ),
     (
         "doctor {tmp}/none",
         "expected the root of a 3DGS checkout, or its training script",
@@ -145,11 +175,9 @@ def places(tmp_path: Path) -> dict[str, str]:
     (runs["odd_metrics"] / "metrics.json").write_text("{")
     with (runs["odd_history"] / "history.jsonl").open("a") as stream:
         stream.write("nonsense\n")
-    script = tmp_path / "plain.py"
-    script.write_text('if __name__ == "__main__":\n    print()\n')
     (tmp_path / "experiment.toml").write_text(EXPERIMENT)
     named = {"scene": scene, "other": other, "masked": masked, **runs, "new": tmp_path / "new", "tmp": tmp_path}
-    named |= {"checkout": CHECKOUTS / "graphdeco", "script": script, "experiment": tmp_path / "experiment.toml"}
+    named |= {"checkout": CHECKOUTS / "graphdeco", "experiment": tmp_path / "experiment.toml"}
     return {name: str(path) for name, path in named.items()}
 
 
