@@ -263,7 +263,9 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
             f"--iterations {asked}: the run in {run} is being extended to {begun}; leave the option out to continue "
             f"that, or delete {archive.path(CHECKPOINT)} to extend the finished run anew"
         )
-    if asked is not None and asked < done:  # as many are those of a run that was stopped after its last one
+    if (
+        asked is not None and asked < done
+    ):  # a run killed after its last iteration has as many as its own command asks for
         raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
     goal = asked or begun or done
     if goal == done:

@@ -128,11 +128,8 @@ ADVICE = [
     ("render {run} --views some", "expected test, train or all", ["render {run} --views all"]),
     (
         "sample {scene} --size 32x24 --views 3 --points 9",
-        "choose another or replace it with --overwrite",
-        [
-            "sample {new} --size 32x24 --views 3 --points 9",
-            "sample {new} --size 32x24 --views 3 --points 9 --overwrite",
-        ],
+        "expected an empty or new folder; choose another",
+        ["sample {new} --size 32x24 --views 3 --points 9"],
     ),
     (
         "doctor {tmp}/none",
