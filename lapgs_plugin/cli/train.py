@@ -265,7 +265,7 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
         )
     if (
         asked is not None and asked < done
-    ):  # a run killed after its last iteration has as many as its own command asks for
+    ):  # a run killed after its last iteration has `asked`
         raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
     goal = asked or begun or done
     if goal == done:
