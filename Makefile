@@ -33,7 +33,7 @@ kernels: $(VENV)/.installed
 
 smoke: $(VENV)/.installed
 	rm -rf $(SMOKE)
-	$(BIN)/lapgs bench benchmarks/smoke.toml --out $(SMOKE)
+	$(BIN)/lapgs bench smoke --out $(SMOKE)
 
 # Whether tests that compare two computations hold on other processors: raster, unit and contract tests, with PyTorch and
 # Numba told to compute as for narrower ones. Takes several times as long as `make test` and is no part of it.

@@ -25,6 +25,11 @@ def printable(text: str) -> str:
     )
 
 
+def printable_lines(text: str) -> str:
+    """Escape each line of a text for a terminal, as `printable`."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def one_line(text: str) -> str:
     """Return text as one printable line without the middle of very long text."""
     line = printable(text)

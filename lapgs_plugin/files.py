@@ -48,6 +48,16 @@ def as_pip_argument(folder: Path) -> str:
     return shlex.quote(os.path.join(".", folder))  # noqa: PTH118
 
 
+def shipped(name: str) -> Path:
+    """Return a folder that comes with the package: inside it where it is installed, else at the top of the repository.
+
+    Args:
+        name: "docs" or "patches", see `setup.py`.
+    """
+    installed = Path(__file__).parent / name
+    return installed if installed.is_dir() else Path(__file__).parents[1] / name
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`, and rename it to `path` when the block ends without an error.
@@ -146,7 +156,7 @@ def write_text(path: Path, text: str, *, training: bool = False) -> None:
         RunFolderError: see `one_line_errors`.
     """
     with one_line_errors(path, training=training), atomic_write(path) as stream:
-        stream.write(text.encode())
+        stream.write(text.encode(errors="backslashreplace"))  # names that are no UTF-8
 
 
 def is_file(path: Path) -> bool:

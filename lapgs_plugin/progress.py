@@ -20,9 +20,18 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from lapgs_plugin.errors import printable_lines
+
 LEAST_SECONDS, MOST_SECONDS, STEP = 10.0, 60.0, 0.05
 """Outside of a terminal a line is printed at every `STEP` of the work and at least every `MOST_SECONDS`, but not more
 often than every `LEAST_SECONDS`."""
+
+
+class EscapingConsole(Console):
+    """A console that shows control characters of names as escapes, also in tables."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable_lines(text), **options)
 
 
 class LoggingProgress(Progress):
@@ -107,6 +116,6 @@ def item_progress(unit: str) -> Progress:
         MofNCompleteColumn(),
         RateColumn(unit),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=EscapingConsole(stderr=True),
         unit=unit,
     )

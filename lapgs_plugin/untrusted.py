@@ -48,6 +48,8 @@ DEPTH = 100
 KEY_PARTS = 32
 """Most parts of a dotted TOML key; a parser's memory grows with their square."""
 LARGEST_INTEGER = 2**63
+LARGEST_FLOAT = 2.0**128
+"""Float32 numbers are smaller; sums and products of larger ones could be inf."""
 
 STRICT: Any = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
 """`__pydantic_config__` of a dataclass whose values come from a file."""
@@ -309,7 +311,8 @@ def _unusable(value: Any, finite: bool) -> str | None:
         broken = not value.isascii() and re.search("[\ud800-\udfff]", value)
         return f"text {shortened(value)}, expected UTF-8" if broken else None
     if isinstance(value, float):
-        return f"number {value}, expected finite numbers" if finite and not math.isfinite(value) else None
+        usable = math.isfinite(value) and abs(value) < LARGEST_FLOAT
+        return f"number {value}, expected finite numbers below {LARGEST_FLOAT:.2g}" if finite and not usable else None
     if isinstance(value, int):
         return f"number {_digits(value)}, expected 64 bits at most" if abs(value) > LARGEST_INTEGER else None
     if value is None:

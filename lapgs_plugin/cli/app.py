@@ -13,10 +13,12 @@ from typer.core import TyperGroup
 from lapgs_plugin import __version__, interrupt
 from lapgs_plugin.cli import patch
 from lapgs_plugin.cli.bench import bench_app
+from lapgs_plugin.cli.config_file import naming_the_config
 from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.export import export
+from lapgs_plugin.cli.help import show_topic
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
@@ -42,7 +44,7 @@ class Commands(TyperGroup):
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: Any) -> Any:
-        with interrupt.command(), one_line_usage_errors(ctx):
+        with interrupt.command(), naming_the_config(ctx.meta), one_line_usage_errors(ctx):
             return super().invoke(ctx)
 
 
@@ -76,7 +78,7 @@ def options(
 
     Get a scene with `lapgs sample` or `lapgs prepare`. Train it with `lapgs train`, or with the train.py of a checkout
     through `lapgs run`. Then use `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` on the run folder.
-    `lapgs doctor` checks this machine.
+    `lapgs doctor` checks this machine. `lapgs help` has the documentation.
     """
 
 
@@ -94,6 +96,7 @@ app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)
 app.add_typer(patch.app, name="patch")
 app.command("doctor")(doctor)
+app.command("help")(show_topic)
 
 
 def _flowing_help(group: typer.Typer) -> None:

@@ -15,7 +15,7 @@ from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.experiments.settings import BenchSettings
 
 EXPERIMENT = "run"
-"""The default subcommand: `lapgs bench smoke.toml`."""
+"""The default subcommand: `lapgs bench smoke`."""
 
 
 class _ExperimentByDefault(TyperGroup):
@@ -30,7 +30,10 @@ class _ExperimentByDefault(TyperGroup):
 @takes_settings
 def experiment(
     experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file, such as benchmarks/smoke.toml.")
+        Path,
+        typer.Argument(
+            metavar="EXPERIMENT", help="TOML file, or the name of an experiment that comes with lapgs, such as smoke."
+        ),
     ],
     settings: BenchSettings,
 ) -> None:
@@ -41,9 +44,9 @@ def experiment(
 
     Examples:
 
-        lapgs bench benchmarks/smoke.toml
+        lapgs bench smoke
 
-        lapgs bench benchmarks/split.toml --path mipnerf360=/data/360
+        lapgs bench split --path mipnerf360=/data/360
     """
     from lapgs_plugin.cli.bench_experiment import run_experiment
 
@@ -87,7 +90,7 @@ def ops(
 bench_app = typer.Typer(
     name="bench",
     cls=_ExperimentByDefault,
-    help="Run an experiment file (lapgs bench EXPERIMENT.toml), or benchmark one part of this package.",
+    help="Run an experiment (lapgs bench EXPERIMENT), or benchmark one part of this package.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

@@ -13,10 +13,17 @@ from rich.markup import escape
 
 from lapgs_plugin import __version__
 from lapgs_plugin.cli.bench_check import READS_SCENES, check_runs
-from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.output import make_console, say
 from lapgs_plugin.cli.run import run as run_script
 from lapgs_plugin.cli.train import train
-from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.errors import (
+    LapgsError,
+    MissingExtraError,
+    RunFolderError,
+    TrainingStoppedError,
+    UserInputError,
+    printable_lines,
+)
 from lapgs_plugin.experiments import exports
 from lapgs_plugin.experiments.aggregate import baseline_of, check_table, make_table
 from lapgs_plugin.experiments.commands import Locations
@@ -26,10 +33,12 @@ from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
 from lapgs_plugin.experiments.mistakes import Mistakes
 from lapgs_plugin.experiments.schema import Experiment, load_experiment
 from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
+from lapgs_plugin.experiments.standard import experiment_file
 from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
 from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
+from lapgs_plugin.runs.layout import require_place, require_utf8
 
 SET_BY_EXPERIMENTS = {
     *("scene", "out", "iterations", "resolution", "images", "eval", "seed", "rasterizer", "resume", "overwrite"),
@@ -47,7 +56,8 @@ class RunsFailedError(LapgsError):
 
 
 def run_experiment(file: Path, settings: BenchSettings) -> None:
-    """Do what `lapgs bench EXPERIMENT.toml` says in its help."""
+    """Do what `lapgs bench EXPERIMENT` says in its help."""
+    file = experiment_file(file)
     experiment = load_experiment(file, _option_names())
     mistakes = Mistakes(file, experiment, settings.selection)
     with mistakes.at("table"):
@@ -59,6 +69,7 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
         _write(experiment, planned, folder)
         return
     if not settings.dry_run:
+        require_utf8(folder, "--out")
         check_launcher(settings.engine)
         require_place(folder)
     scenes, places = scenes_of(experiment, settings.selection), Locations(settings.folders, file.parent)
@@ -105,9 +116,9 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
 
 def _print_commands(jobs: Sequence[Job]) -> None:
     for job in jobs:
-        print(f"# {job.run_id}")
+        say(f"# {job.run_id}")
         for step in job.steps:
-            print(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
+            say(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
 def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:
@@ -122,7 +133,7 @@ def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:
     with item_progress("runs") as progress:
         task = progress.add_task("Running", total=len(run_ids), completed=finished)
 
-        def say(outcome: Outcome) -> None:
+        def show(outcome: Outcome) -> None:
             progress.advance(task)
             if outcome.state == FAILED:
                 text = f"[red]failed[/red] {outcome.run_id}\n{escape(outcome.error)}"
@@ -131,7 +142,7 @@ def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:
             progress.console.print(text, soft_wrap=True, highlight=False)
 
         try:
-            execute(store, run_ids, lambda: launch(order), say)
+            execute(store, run_ids, lambda: launch(order), show)
         except KeyboardInterrupt:
             raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 
@@ -159,10 +170,10 @@ def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) 
     write_text(folder / exports.LATEX, latex(table))
     _write_rows(experiment, planned, records, folder)
     console = make_console()
-    console.print(Markdown(text)) if console.is_terminal else print(text)
+    console.print(Markdown(printable_lines(text))) if console.is_terminal else say(text)
     _name_versions(records)
-    print(f"{folder} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
-    print(f"next: lapgs report {shlex.quote(str(folder))} writes a page with curves and images")
+    say(f"{folder} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    say(f"next: lapgs report {shlex.quote(str(folder))} writes a page with curves and images")
     if failed := [o for o in outcomes.values() if o.state == FAILED]:
         raise RunsFailedError(
             f"{len(failed)} of {len(outcomes)} runs failed, the first is {failed[0].run_id}; its log is in "

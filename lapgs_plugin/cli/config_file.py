@@ -5,28 +5,61 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lapgs_plugin import __version__
-from lapgs_plugin.errors import UserInputError, nearest
+from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError, nearest
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.runs.layout import RUN_CONFIG
 from lapgs_plugin.training.strategies import GRADIENTS, MCMC
-from lapgs_plugin.untrusted import read_toml
+from lapgs_plugin.untrusted import read_text, read_toml
+
+if TYPE_CHECKING:
+    from lapgs_plugin.training.settings import TrainSettings
 
 OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
 """Parameters that say where a run goes and how it is started, not what it is."""
+META_KEY = "lapgs_plugin.config"
+"""Key of click's `Context.meta` for the command's context and the settings file that it reads."""
 
 
 def _load(context: typer.Context, path: Path | None) -> Path | None:
     """Take the values of a settings file as defaults of the command's other parameters."""
     if path is not None:
         context.default_map = {**(context.default_map or {}), **_read(context, path)}
+        context.meta[META_KEY] = context, path
     return path
+
+
+@contextmanager
+def naming_the_config(meta: Mapping[str, Any]) -> Iterator[None]:
+    """Begin errors about an option or a scene with the settings file that gave it.
+
+    Args:
+        meta: of the command's context, or of one above it.
+
+    Raises:
+        LapgsError: the block raised it, or a kind of it.
+    """
+    try:
+        yield
+    except LapgsError as error:
+        context, path = meta.get(META_KEY, (None, None))
+        if context is None:
+            raise
+        option = re.match("(?:invalid value for ')?--([a-z-]+)", str(error))
+        name = option[1].replace("-", "_") if option else "scene"
+        source = context.get_parameter_source(name)
+        about = option is not None or str(error).startswith(str(context.params.get(name)))
+        if source is None or source.name != "DEFAULT_MAP" or not about:
+            raise
+        raise type(error)(f"{path}: {error}") from error
 
 
 ConfigOption = Annotated[
@@ -78,20 +111,23 @@ def _of_this_version(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def extend_config(path: Path, iterations: int, extended: int, strategy: str) -> None:
-    """Replace what the extension of a run changed in its settings file; older runs have no such file.
+def extended_config(path: Path, settings: TrainSettings) -> str | None:
+    """Return a run's settings file with what the extension of the run changes; None if the run, an older one, has none.
 
     Args:
         path: of the file.
-        iterations: of the longer run.
-        extended: those after the schedule's end.
-        strategy: of the run; "auto" could choose another one for so many iterations.
+        settings: of the longer run. Its strategy replaces "auto", which could choose another one for that length.
+
+    Raises:
+        RunFolderError: the file cannot be read.
     """
-    if path.is_file():
-        line = f"iterations = {iterations}  # the last {extended} extended the finished run"
-        text = re.sub(r"(?m)^iterations = .*$", line, path.read_text(encoding="utf-8"))
-        text = re.sub(r'(?m)^strategy = "auto"$', f"strategy = {json.dumps(strategy)}", text)
-        write_text(path, text)
+    if not path.is_file():
+        return None
+    text = read_text(path, error=RunFolderError, advice="restore it, or delete it: the run does not need it")
+    line = f"iterations = {settings.iterations}  # the last {settings.extended} extended the finished run"
+    text = re.sub(r"(?m)^iterations = .*$", line, text)
+    strategy = json.dumps(settings.densification.strategy)
+    return re.sub(r'(?m)^strategy = "auto"$', f"strategy = {strategy}", text)
 
 
 def write_config(path: Path, context: typer.Context, **replaced: str | int) -> None:

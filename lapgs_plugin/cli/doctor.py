@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +15,8 @@ from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import UserInputError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
+
     from lapgs_plugin.environment.findings import Finding
     from lapgs_plugin.environment.probes import Probe
 
@@ -57,7 +61,7 @@ def doctor(
 
 def examine() -> dict[str, list[Finding]]:
     """Return all findings by section, the conclusion last. Slow probes run in parallel."""
-    from concurrent.futures import ThreadPoolExecutor
+    from concurrent.futures import ThreadPoolExecutor, wait
 
     from lapgs_plugin.adapters.registry import known_extensions
     from lapgs_plugin.environment import driver_version, findings
@@ -68,12 +72,14 @@ def examine() -> dict[str, list[Finding]]:
         modules, adapters = known_extensions(), []
     except UserInputError as error:  # of an installed package
         modules, adapters = {}, [findings.Finding("Backbones", "problem", str(error))]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor() as pool, _stopping_programs(pool):
         torch_probe = pool.submit(run_probe, "torch")
         raster_probe = pool.submit(run_probe, "rasterizer")
         driver = pool.submit(driver_version)
         imports = {name: pool.submit(run_probe, "import", name) for name in IMPORTED}
         extensions = [pool.submit(findings.extension_finding, *known) for known in modules.items()]
+        everything: list[Future[Any]] = [torch_probe, raster_probe, driver, *imports.values(), *extensions]
+        wait(everything)
     torch = torch_probe.result()
     compilers = findings.compiler_findings(torch.facts.get("cuda"))
     sections = {
@@ -93,6 +99,19 @@ def examine() -> dict[str, list[Finding]]:
         ],
     }
     return {**{title: found for title, found in sections.items() if found}, "lapgs train": _conclusion(sections, torch)}
+
+
+@contextmanager
+def _stopping_programs(pool: Executor) -> Iterator[None]:
+    """Kill the programs that a pool's threads run when a signal ends the block, for the process waits for them."""
+    from lapgs_plugin.environment import stop_programs
+
+    try:
+        yield
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        stop_programs()
+        raise
 
 
 def current_folder(folder: Path, has_gpu: bool) -> Finding:

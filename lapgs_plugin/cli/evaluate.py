@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table, show_log
+from lapgs_plugin.cli.output import make_console, make_table, say, show_log
 from lapgs_plugin.errors import counted, printable
 from lapgs_plugin.options import check_values, option, refuse
 from lapgs_plugin.rendering.options import RenderOptions
@@ -94,7 +94,7 @@ def evaluate(
     show_log()
     metrics = evaluate_run(archive, options, wanted)
     _print(metrics)
-    print(f"{archive.path(METRICS)} holds these figures")
+    say(f"{archive.path(METRICS)} holds these figures")
 
 
 def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: RenderOptions) -> None:
@@ -119,7 +119,7 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
         f"one before, where both show the same surface ({100 * figures['compared']:.0f} % of the pixels)",
         table,
     )
-    print(f"{archive.path(STABILITY)} holds these figures")
+    say(f"{archive.path(STABILITY)} holds these figures")
 
 
 def _print(metrics: dict[str, Any]) -> None:

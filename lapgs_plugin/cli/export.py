@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.output import make_console, say
 from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
+from lapgs_plugin.runs.layout import require_place
 
 if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -143,7 +144,7 @@ def _make(folder: Path) -> None:
 
 
 def _print_written(path: Path, field: GaussianField, remark: str = "") -> None:
-    print(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{remark}")
+    say(f"{path}: {len(field):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB{remark}")
 
 
 def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> GaussianField:
@@ -158,7 +159,7 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
     if merged.photo_psnr is not None:
         line += f"; against the photos {merged.photo_psnr[1]:.2f} dB, where the run has {merged.photo_psnr[0]:.2f}"
         line += ", both after a colour fit" if merged.colors_fitted else ""
-    print(f"merged field: {line}")
+    say(f"merged field: {line}")
     return merged.field
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lapgs_plugin.adapters.registry import OWN
+from lapgs_plugin.cli.output import say
 from lapgs_plugin.errors import UserInputError
 
 
@@ -60,12 +61,10 @@ def import_run(
     )
     for record in archive.manifest.records:
         width, height = record.image_size
-        print(
-            f"level {record.level}: {record.num_gaussians:,} Gaussians, {record.iterations:,} steps, {width}x{height}"
-        )
+        say(f"level {record.level}: {record.num_gaussians:,} Gaussians, {record.iterations:,} steps, {width}x{height}")
     if not run.times_are_known:
-        print("the training time is not recorded there: it is shown as 0")
-    print(f"{archive.path()} holds the run")
+        say("the training time is not recorded there: it is shown as 0")
+    say(f"{archive.path()} holds the run")
 
 
 def _parsed(texts: list[str]) -> dict[str, Any]:

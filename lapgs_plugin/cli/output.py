@@ -1,16 +1,15 @@
-"""Print tables and logs, name the command that comes next, and check where results go."""
+"""Print tables and logs, and name the command that comes next."""
 
 from __future__ import annotations
 
 import logging
 import os
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.files import is_folder
-from lapgs_plugin.limits import LONGEST_NAME
+from lapgs_plugin.errors import printable_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,12 +24,32 @@ def make_console(*, stderr: bool = False) -> Console:
 
     The environment variable COLUMNS sets the width of either.
     """
-    from rich.console import Console
+    from lapgs_plugin.progress import EscapingConsole
 
-    made = Console(stderr=stderr, highlight=False)
-    if not made.is_terminal and not os.environ.get("COLUMNS", "").isdecimal():
-        made.width = UNLIMITED
-    return made
+    console = EscapingConsole(stderr=stderr, highlight=False)
+    if not console.is_terminal and not os.environ.get("COLUMNS", "").isdecimal():
+        console.width = UNLIMITED
+    return console
+
+
+def say(text: str, *, stderr: bool = False) -> None:
+    """Print lines at once, with control characters of names as escapes."""
+    print(printable_lines(text), file=sys.stderr if stderr else sys.stdout, flush=True)
+
+
+class _EscapingFormatter(logging.Formatter):
+    """Show control characters of names as escapes in messages of this package."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return printable_lines(text) if record.name.startswith("lapgs_plugin") else text
+
+
+def log_to_stderr(pattern: str = "lapgs: %(message)s") -> None:
+    """Print log records on stderr, unless the program set up logging before."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(_EscapingFormatter(pattern))
+    logging.basicConfig(handlers=[handler])
 
 
 def make_table(*headings: str) -> Table:
@@ -43,7 +62,7 @@ def make_table(*headings: str) -> Table:
 
 def show_log() -> None:
     """Print on stderr which rasterizer renders a run, and why."""
-    logging.basicConfig(format="lapgs: %(message)s")
+    log_to_stderr()
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.INFO)
 
 
@@ -51,21 +70,3 @@ def train_command(scene: Path, options: str = "") -> str:
     """Return the command that trains a scene with further options, as a user can paste it."""
     run = Path("runs") / scene.absolute().name
     return f"lapgs train {shlex.quote(str(scene))} -o {shlex.quote(str(run))} --eval {options}".rstrip()
-
-
-def require_place(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written, before the work whose result it is for. Writes nothing.
-
-    Raises:
-        UserInputError: it is a file or below one, or it is not writable.
-    """
-    existing = str(folder)
-    # Not Path.exists, which raises where a name is too long for the file system.
-    while not os.path.lexists(existing):
-        if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
-            raise UserInputError(f"--out {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
-        existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
-    if not is_folder(Path(existing)):
-        raise UserInputError(f"--out {folder}: {existing} is a file; expected a folder, or a name for a new one")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise UserInputError(f"--out {folder}: {existing} is not writable; choose another folder")

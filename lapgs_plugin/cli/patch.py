@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from lapgs_plugin.cli.output import say
 from lapgs_plugin.errors import PatchError
 from lapgs_plugin.patching.engine import ALL_SETS, FileChange, Target, find_targets, plan_apply, plan_revert, status
 from lapgs_plugin.patching.files import alone, read_only, uncommitted, write_all
@@ -45,7 +46,7 @@ SetName = Annotated[
         "--set",
         help="Edits to apply: signed-color (native rendering of residual fields), build-cuda13 (build with CUDA 12.8 "
         "to 13), or all for both. gradient-fixes and robustness, for some rasterizers, mend faults of ordinary "
-        "training and are not part of all. See docs/rasterizers.md.",
+        "training and are not part of all. See `lapgs help rasterizers`.",
     ),
 ]
 AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files with uncommitted changes.")]
@@ -57,18 +58,18 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         for target, sets in chosen:
-            typer.echo(f"{target.folder}: {target.recipe.title}")
+            say(f"{target.folder}: {target.recipe.title}")
             for found in status(target):
                 if found.set not in sets:
                     continue
-                typer.echo(f"  {found.set:14} {found.state.value}")
+                say(f"  {found.set:14} {found.state.value}")
                 for problem in found.problems:
-                    typer.echo(f"    {problem}")
+                    say(f"    {problem}")
                 if not found.problems:
                     for path in read_only(plan_apply(target, [found.set])):
-                        typer.echo(f"    read-only: {path}")
+                        say(f"    read-only: {path}")
             for path in uncommitted(target.paths.values()):
-                typer.echo(f"  uncommitted changes: {path}")
+                say(f"  uncommitted changes: {path}")
 
 
 @app.command("diff")
@@ -76,7 +77,7 @@ def diff(checkout: Checkout, set_name: SetName = "all") -> None:
     """Print the changes of `lapgs patch apply` as a unified diff."""
     changes = [change for _, change in _planned(_targets(checkout, set_name, opt_in=False))]
     if not changes:
-        typer.echo(f"{checkout}: nothing to apply, these edits are applied already: {set_name}", err=True)
+        say(f"{checkout}: nothing to apply, these edits are applied already: {set_name}", stderr=True)
     for change in changes:
         typer.echo(_unified(change, checkout), nl=False)
 
@@ -93,7 +94,7 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
         if planned:
             _write("patched", planned, allow_dirty)
         else:
-            typer.echo(f"{checkout}: nothing to do, these edits are applied already: {set_name}")
+            say(f"{checkout}: nothing to do, these edits are applied already: {set_name}")
 
 
 @app.command("revert")
@@ -105,7 +106,7 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
         if planned:
             _write("reverted", planned, allow_dirty=True)
         else:
-            typer.echo(f"{checkout}: nothing to remove, none of these edits is applied: {set_name}")
+            say(f"{checkout}: nothing to remove, none of these edits is applied: {set_name}")
 
 
 @contextmanager
@@ -113,7 +114,7 @@ def _alone(chosen: Sequence[tuple[Target, Collection[str]]]) -> Iterator[None]:
     """Lock out other `lapgs patch` processes, and remove files that a killed one left."""
     with alone(target for target, _ in chosen) as stuck:
         for path in stuck:
-            typer.echo(f"a killed `lapgs patch` left {path}, which cannot be removed", err=True)
+            say(f"a killed `lapgs patch` left {path}, which cannot be removed", stderr=True)
         yield
 
 
@@ -157,11 +158,11 @@ def _write(verb: str, planned: Sequence[tuple[Target, FileChange]], allow_dirty:
         )
     write_all(changes)
     for change in changes:
-        typer.echo(f"{verb} {change.path}")
+        say(f"{verb} {change.path}")
     commands = [target.reinstall for target, _ in planned]
-    typer.echo("Next, reinstall the changed extensions:")
+    say("Next, reinstall the changed extensions:")
     for command in dict.fromkeys(commands):
-        typer.echo(f"  {command}")
+        say(f"  {command}")
 
 
 def _listed(paths: Sequence[Path]) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import train_command
+from lapgs_plugin.cli.output import log_to_stderr, say, train_command
 from lapgs_plugin.cli.train import MINUTES_ON_A_CPU, long_on_a_cpu
 from lapgs_plugin.errors import MissingExtraError, counted
 from lapgs_plugin.hierarchy.settings import AUTO
@@ -44,17 +44,17 @@ def prepare(
     from lapgs_plugin.interrupt import advise
     from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 
-    logging.basicConfig(format="%(message)s")
+    log_to_stderr("%(message)s")
     logging.getLogger("lapgs_plugin.scenes").setLevel(logging.INFO)
     advise(f"{out} keeps the finished steps, repeat the command to continue")
     result = prepare_scene(photos, out, settings, overwrite=overwrite)
     total = len(result.registered) + len(result.left_out)
     error = f"mean reprojection error {result.reprojection_error:.2f} pixels, " if result.reprojection_error else ""
-    typer.echo(
+    say(
         f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, {error}"
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
-    typer.echo(f"next: {_next_command(out, result.registered)}")
+    say(f"next: {_next_command(out, result.registered)}")
 
 
 def _next_command(out: Path, registered: Sequence[str]) -> str:

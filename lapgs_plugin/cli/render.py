@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table, require_place, show_log
+from lapgs_plugin.cli.output import make_console, make_table, say, show_log
 from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.options import check_values, option, refuse
 from lapgs_plugin.rendering.options import RenderOptions
+from lapgs_plugin.runs.layout import require_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -166,7 +167,7 @@ def _write_clip(
         panels=settings.panels,
         image_format=settings.image_format,
     )
-    print(f"{out} holds the clip, {counted(len(cameras), 'frame')}")
+    say(f"{out} holds the clip, {counted(len(cameras), 'frame')}")
 
 
 def _choose(scene: Scene, views: str | None) -> dict[str, tuple[View, ...]]:
@@ -204,7 +205,7 @@ def _print_speeds(
             f"{speed.milliseconds:.2f}",
             f"{speed.fps:.1f}",
         )
-    print(f"Frames a second, medians over {counted(len(cameras), 'camera')}")
+    say(f"Frames a second, medians over {counted(len(cameras), 'camera')}")
     make_console().print(table)
 
 
@@ -219,7 +220,7 @@ def _write_views(
     require_place(folder)
     for split, chosen in _choose(run_scene(archive, scene), settings.views).items():
         _write_split(renderer, chosen, level, folder / split, settings)
-    print(f"{folder} holds the images")
+    say(f"{folder} holds the images")
 
 
 def _write_split(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import make_console, make_table, show_log
+from lapgs_plugin.cli.output import make_console, make_table, say, show_log
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.rendering.options import RenderOptions
 
@@ -55,14 +55,14 @@ def report(
 
         show_log()
         page = write_experiment_report(run, options)
-        print(f"{page} shows the experiment")
+        say(f"{page} shows the experiment")
         return
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
     show_log()
     runs = [MeasuredRun(archive, run_metrics(archive, options)) for archive in archives]
     page = write_report(runs[0], runs[1] if len(runs) > 1 else None, options)
     _print(runs)
-    print(f"{page} shows this with curves and images")
+    say(f"{page} shows this with curves and images")
 
 
 def _newest(folder: Path) -> Path:

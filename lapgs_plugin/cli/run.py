@@ -12,6 +12,7 @@ import typer
 
 from lapgs_plugin.adapters.registry import GENERIC, OWN, adapter_class
 from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.output import log_to_stderr
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import UserInputError
@@ -117,7 +118,7 @@ def run(
     if isinstance(context.obj, Rehearsal):
         context.obj.run(settings, words)
         return
-    logging.basicConfig(format="lapgs: %(message)s")
+    log_to_stderr()
     logging.getLogger("lapgs_plugin").setLevel(logging.INFO)
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.WARNING)  # of the preview
     attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")

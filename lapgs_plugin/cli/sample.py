@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lapgs_plugin.cli.output import train_command
+from lapgs_plugin.cli.output import say, train_command
 
 MINUTES_ON_A_CPU = "--iterations 2000"
 """Options that are proposed: by its number of views the scene would get ten thousand."""
@@ -33,5 +33,5 @@ def sample(
     make_sample_scene(
         out, width=width, height=height, views=views, points=points, seed=seed, overwrite=overwrite, progress=True
     )
-    typer.echo(f"{out}: {views} images of {width}x{height}, {points} points")
-    typer.echo(f"next: {train_command(out, MINUTES_ON_A_CPU)}")
+    say(f"{out}: {views} images of {width}x{height}, {points} points")
+    say(f"next: {train_command(out, MINUTES_ON_A_CPU)}")

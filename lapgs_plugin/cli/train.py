@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin.cli.bridge import given_options, takes_settings
-from lapgs_plugin.cli.config_file import ConfigOption, extend_config, write_config
-from lapgs_plugin.cli.output import make_console, require_place
+from lapgs_plugin.cli.config_file import ConfigOption, extended_config, write_config
+from lapgs_plugin.cli.output import log_to_stderr, make_console
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
 from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
+from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option, option_values
-from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
+from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD, require_place
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
@@ -97,6 +98,7 @@ def train(
     """
     from lapgs_plugin.scenes.masks import resolve_masks
 
+    log_to_stderr("%(message)s")
     watcher = context.with_resource(watching(start.viewing, out.absolute().name))
     reference = _reference(scene, photos)
     if isinstance(context.obj, Rehearsal):
@@ -261,7 +263,7 @@ def _extended(archive: RunArchive, settings: TrainSettings, asked: int | None) -
             f"--iterations {asked}: the run in {run} is being extended to {begun}; leave the option out to continue "
             f"that, or delete {archive.path(CHECKPOINT)} to extend the finished run anew"
         )
-    if asked is not None and asked <= done:
+    if asked is not None and asked < done:  # a run killed after its last iteration has `asked`
         raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
     goal = asked or begun or done
     if goal == done:
@@ -343,6 +345,7 @@ def _run(
     placed = training_rasterizer(manifest.rasterizer, settings)
     if placed.device.type == "cpu" and (hint := long_on_a_cpu(scene.smallest_size, settings.iterations)):
         console.print(hint, soft_wrap=True)
+    config = extended_config(archive.path(RUN_CONFIG), settings) if resume and settings.extended else None
     with one_pool(), ExitStack() as opened:
         monitor: Monitor = opened.enter_context(ProgressMonitor(console, manifest.levels))
         if control.log is not None:
@@ -362,9 +365,8 @@ def _run(
             watcher=watcher,
         )
         trainer.run(resume)
-    if resume and settings.extended:
-        strategy = settings.densification.strategy
-        extend_config(archive.path(RUN_CONFIG), settings.iterations, settings.extended, strategy)
+    if config is not None:
+        write_text(archive.path(RUN_CONFIG), config)
 
 
 def _say_masked(console: Console, scene: Scene, masks_from: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
-from lapgs_plugin.cli.output import show_log
+from lapgs_plugin.cli.output import say, show_log
 from lapgs_plugin.cli.viewing import HOST, PORT, open_page
 from lapgs_plugin.errors import require_extra
 from lapgs_plugin.files import require_manifest
@@ -72,7 +72,7 @@ def _serve(page: Page, run: Path, baseline: Path | None, options: RenderOptions)
     shown = FollowedRun(run, options)
     other = None if baseline is None else FollowedRun(baseline, options)
     viewer, stop = Viewer(page), threading.Event()
-    following = RunFollower(viewer, page, shown, other, report=lambda line: print(line, flush=True))
+    following = RunFollower(viewer, page, shown, other, report=say)
     following.begin()
     following.warm_up()
     watching = threading.Thread(target=following.watch, args=(stop,), daemon=True)

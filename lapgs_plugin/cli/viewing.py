@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.errors import UserInputError, require_extra
+from lapgs_plugin.errors import UserInputError, printable, require_extra
 from lapgs_plugin.options import check_values, option
 from lapgs_plugin.runs.watcher import Watcher
 
@@ -49,7 +49,7 @@ def open_page(host: str, port: int, label: str, until: str, preview: Image | Non
     """
     from lapgs_plugin.viewer.page import Page
 
-    page = Page(host, port, label, preview)
+    page = Page(host, port, printable(label), preview)
     print(f"open {page.address} in a browser; {until}", flush=True)
     return page
 

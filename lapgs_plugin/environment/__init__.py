@@ -68,26 +68,46 @@ def driver_version() -> str:
 
 
 def gsplat_built() -> bool | None:
-    """Return whether the installed gsplat includes its compiled CUDA part, None without gsplat. Imports nothing."""
+    """Return whether the installed gsplat includes its compiled CUDA part, None without gsplat. Imports nothing.
+
+    One that gsplat compiled at its first use is elsewhere, and loaded only where nvcc is found
+    (`findings.gsplat_finding`).
+    """
     spec = importlib.util.find_spec("gsplat")
     if spec is None or not spec.submodule_search_locations:
         return None
     return any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
 
 
+_running: set[subprocess.Popen[str]] = set()
+"""Programs of `run_program`, in all threads."""
+
+
 def run_program(command: Sequence[str], **options: Any) -> tuple[str, str]:
     """Run a program; return its standard output and a line about an error, "" without one. Never raises."""
+    pipe = subprocess.PIPE
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False, **options
-        )
-    except subprocess.TimeoutExpired:
-        return "", f"no answer within {TIMEOUT:.0f} s"
+        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace", **options)
     except OSError as error:
         return "", error.strerror or str(error)
-    if done.returncode < 0:
-        return done.stdout, f"crashed ({signal.strsignal(-done.returncode)})"
-    if done.returncode > 0:
-        lines = done.stderr.strip().splitlines()
-        return done.stdout, lines[-1] if lines else f"exit code {done.returncode}"
-    return done.stdout, ""
+    with process:
+        _running.add(process)
+        try:
+            printed, complaints = process.communicate(timeout=TIMEOUT)
+        except subprocess.TimeoutExpired:
+            return "", f"no answer within {TIMEOUT:.0f} s"
+        finally:
+            process.kill()
+            _running.discard(process)
+    if process.returncode < 0:
+        return printed, f"crashed ({signal.strsignal(-process.returncode)})"
+    if process.returncode > 0:
+        lines = complaints.strip().splitlines()
+        return printed, lines[-1] if lines else f"exit code {process.returncode}"
+    return printed, ""
+
+
+def stop_programs() -> None:
+    """Kill the programs that `run_program` runs in other threads."""
+    for process in tuple(_running):
+        process.kill()

@@ -222,7 +222,9 @@ def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:
     if built:
         return Finding("gsplat CUDA part", "ok", "built")
     if nvcc:
-        return Finding("gsplat CUDA part", "ok", "not built yet; gsplat compiles it at first use, which takes minutes")
+        builds = sorted(Path(torch.facts["extensions"]).glob("gsplat_cuda*/gsplat_cuda*.so"))
+        state = f"built at its first use ({builds[0]})" if builds else "not built yet; gsplat compiles it at first use"
+        return Finding("gsplat CUDA part", "ok", state if builds else f"{state}, which takes minutes")
     advice = "install the CUDA toolkit, or a gsplat wheel built for this PyTorch"
     return Finding("gsplat CUDA part", "problem", "not built, and there is no nvcc to compile it", advice)
 

@@ -13,6 +13,7 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.environment import PACKAGE, run_program
@@ -61,7 +62,23 @@ def _probe_torch() -> dict[str, Any]:
         gpus.append(f"{properties.name}, {memory:.0f} GiB, compute capability {properties.major}.{properties.minor}")
     # PyTorch warns why it cannot use a GPU, for example because the driver is too old.
     complaint = str(caught[0].message).splitlines()[0] if caught else ""
-    return {"version": torch.__version__, "cuda": torch.version.cuda, "gpus": gpus, "complaint": complaint}
+    return {
+        "version": torch.__version__,
+        "cuda": torch.version.cuda,
+        "gpus": gpus,
+        "complaint": complaint,
+        "extensions": _extensions_folder(),
+    }
+
+
+def _extensions_folder() -> str:
+    """Return where PyTorch keeps extensions that it compiled, as `cpp_extension.load` chooses it."""
+    import torch
+    from torch.utils.cpp_extension import get_default_build_root
+
+    python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"
+    platform = f"cu{torch.version.cuda.replace('.', '')}" if torch.version.cuda else "cpu"
+    return os.environ.get("TORCH_EXTENSIONS_DIR") or str(Path(get_default_build_root(), f"{python}_{platform}"))
 
 
 def _probe_rasterizer() -> dict[str, Any]:

@@ -13,5 +13,5 @@
     aggregate.py    rows -> a table of means, spreads, ratios and the paper's figures; tables.py writes it
     exports.py      rows as files; report.py: a page made from them
 
-The command is `lapgs bench EXPERIMENT.toml`; docs/measuring.md says how to write one.
+The command is `lapgs bench EXPERIMENT`; `lapgs help measuring` says how to write one.
 """

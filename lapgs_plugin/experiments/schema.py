@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lapgs_plugin.errors import UserInputError, nearest
-from lapgs_plugin.experiments.standard import DATASETS, PRESETS
+from lapgs_plugin.experiments.standard import DATASETS, EXPERIMENTS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 
@@ -257,7 +257,8 @@ def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experim
             an unknown key the nearest known one.
     """
     # The commands refuse numbers that are not finite, and name the option.
-    values = read_toml(path, advice="give an experiment file such as smoke.toml", finite=False)
+    advice = f"give an experiment file, or the name of one that comes with lapgs: {', '.join(EXPERIMENTS)}"
+    values = read_toml(path, advice=advice, finite=False)
     try:
         experiment = Experiment.model_validate(values)
     except ValidationError as error:

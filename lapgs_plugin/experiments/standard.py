@@ -1,6 +1,6 @@
-"""Load standard data sets, backbones' published options for them, and the figures of the paper.
+"""Load standard data sets, backbones' published options for them, experiments, and the figures of the paper.
 
-All of them are files in data/: datasets.toml, presets.toml and paper/*.csv.
+All of them are files in data/: datasets.toml, presets.toml, experiments/*.toml and paper/*.csv.
 """
 
 from __future__ import annotations
@@ -13,11 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_file
 from lapgs_plugin.untrusted import read_toml
 
 DATA = Path(__file__).parent / "data"
+EXPERIMENTS = {path.stem: path for path in sorted((DATA / "experiments").glob("*.toml"))}
+"""Experiment files that come with this package, by name."""
 KEYS = ("dataset", "scene", "row")
 """Columns of a paper table that identify a row."""
+
+
+def experiment_file(given: Path) -> Path:
+    """Return the file of an experiment that a user gave by its path or, for one of `EXPERIMENTS`, by its name."""
+    return given if is_file(given) else EXPERIMENTS.get(str(given), given)
 
 
 @dataclass(frozen=True)

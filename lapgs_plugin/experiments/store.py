@@ -150,7 +150,7 @@ class ResultStore:
     def __init__(self, path: Path) -> None:
         self._path = path
         if not path.is_file():
-            raise RunFolderError(f"{path} does not exist; `lapgs bench EXPERIMENT.toml` makes it")
+            raise RunFolderError(f"{path} does not exist; `lapgs bench EXPERIMENT` makes it")
         with _transaction(self._path) as connection:
             about = dict(connection.execute("SELECT key, value FROM about").fetchall())
         if about.get("format") != str(FORMAT_VERSION):

@@ -93,7 +93,7 @@ def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tup
         known = ", ".join(recipe.name for recipe in recipes)
         raise PatchError(
             f"{checkout}: no rasterizer that is known in this folder (known: {known}); are its submodules checked out? "
-            "patches/README.md says how to add one"
+            "`lapgs help patches` says how to add one"
         )
     return targets
 
@@ -105,7 +105,7 @@ def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
         PatchError: an edit does not fit the sources; the message names the place and the expected code.
     """
     changes, problems = _try_apply(target, sets)
-    _refuse(target, problems, "; a rasterizer that differs needs a recipe of its own, see patches/README.md")
+    _refuse(target, problems, "; a rasterizer that differs needs a recipe of its own, see `lapgs help patches`")
     return changes
 
 

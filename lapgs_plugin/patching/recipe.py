@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from lapgs_plugin.errors import PatchError
+from lapgs_plugin.files import shipped
 from lapgs_plugin.patching.tokens import occurrences, tokenize
 from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
@@ -115,10 +116,10 @@ def _require_tokens(find: str) -> None:
 
 @dataclass(frozen=True)
 class Recipe:
-    """Describe one extension and the edits for it: the content of a file; patches/README.md explains the entries.
+    """Describe one extension and the edits for it: the content of a file; `lapgs help patches` explains the entries.
 
     Attributes:
-        name: stem of its file in `patches/`.
+        name: stem of its file.
         title: name in messages.
         present, absent: places that its folder must and must not have to be recognised.
         extends: name of the recipe that it inherits from.
@@ -162,12 +163,6 @@ class Recipe:
         )
 
 
-def patches_folder() -> Path:
-    """Return the folder of the TOML files: in the installed package, otherwise at the top of the repository."""
-    installed = Path(__file__).parents[1] / "patches"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "patches"
-
-
 def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
     """Return all recipes in `folder`, sorted by name.
 
@@ -177,7 +172,7 @@ def load_recipes(folder: Path | None = None) -> tuple[Recipe, ...]:
     Raises:
         PatchError: a file is not a recipe.
     """
-    paths = sorted((folder or patches_folder()).glob("*.toml"))
+    paths = sorted((folder or shipped("patches")).glob("*.toml"))
     own = {path.stem: _read(path) for path in paths}
     return tuple(_with_inherited(name, own) for name in own)
 
@@ -203,7 +198,7 @@ def _stands(anchor: Anchor, folder: Path) -> bool:
 
 
 def _read(path: Path) -> Recipe:
-    recipe: Recipe = read_toml(path, Recipe, error=PatchError, advice="patches/README.md says what it holds")
+    recipe: Recipe = read_toml(path, Recipe, error=PatchError, advice="`lapgs help patches` says what it holds")
     if recipe.name != path.stem:
         raise PatchError(f"{path}: its name is {shortened(recipe.name)}, expected that of the file; correct it")
     return recipe
@@ -216,10 +211,10 @@ def _with_inherited(name: str, recipes: dict[str, Recipe], heirs: tuple[str, ...
         return own
     if own.extends in (name, *heirs):
         raise PatchError(
-            f"patches/{name}.toml: extends {shortened(own.extends)}, which extends it; expected one without a circle"
+            f"{name}.toml: extends {shortened(own.extends)}, which extends it; expected one without a circle"
         )
     if own.extends not in recipes:
-        raise PatchError(f"patches/{name}.toml: extends {shortened(own.extends)}, expected one of {sorted(recipes)}")
+        raise PatchError(f"{name}.toml: extends {shortened(own.extends)}, expected one of {sorted(recipes)}")
     base = _with_inherited(own.extends, recipes, (name, *heirs))
     edits = {edit.label: edit for edit in (*base.edit, *own.edit)}  # its own replaces one with the same label
     return replace(

@@ -18,7 +18,7 @@ SAME_VALUE = 1e-3
 
 NESTED_WORKS = "nested levels work: --hierarchy nested"
 
-ADAPTER_MENDS = "an adapter whose snapshot() returns what is rendered mends it (docs/extending.md)"
+ADAPTER_MENDS = "an adapter whose snapshot() returns what is rendered mends it: `lapgs help extending`"
 
 NO_RESIDUALS = f"expected the same, to which a residual is added; {ADAPTER_MENDS}, {NESTED_WORKS}"
 

@@ -51,7 +51,7 @@ from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runner.step_clock import counting_steps
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import CACHE
+from lapgs_plugin.runs.layout import CACHE, require_place, require_utf8
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.watcher import Watcher
@@ -146,6 +146,8 @@ class HierarchyDriver:
         folder, source = given.absolute(), Path(call.dataset.source_path)
         if not self._resume:
             RunArchive.require_room(given, self._overwrite, self._since)
+            require_place(given, "-m")
+            require_utf8(given, "-m")
         if not source.exists():
             raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
         if self._options.images_on == "disk":  # that of the run: the one of temporary files may be in memory
@@ -249,6 +251,8 @@ class HierarchyDriver:
         archive = RunArchive.open(folder, resume=True)
         try:
             require_same_run(archive.manifest, manifest)
+            if archive.manifest.complete:
+                logger.info("the run in %s is finished: nothing is left to train", folder)
         except BaseException:
             archive.close()
             raise

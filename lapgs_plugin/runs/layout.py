@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,11 @@ from lapgs_plugin.files import (
     MANIFEST,
     PREVIEW,
     TEMPORARY_PATTERN,
+    is_folder,
     one_line_errors,
     require_own_entries,
 )
+from lapgs_plugin.limits import LONGEST_NAME
 from lapgs_plugin.untrusted import TEXT_BYTES, read_json
 
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
@@ -85,6 +88,49 @@ def require_room(path: Path | str, overwrite: bool = False, since: int | None = 
         raise RunFolderError(
             f"{folder} is not empty and not a run (it holds {min(strangers)}); choose a new or empty folder"
         )
+
+
+def require_place(folder: Path, option: str = "--out") -> None:
+    """Refuse a folder that cannot be made or written, before the work whose result it is for. Leaves no file behind.
+
+    Args:
+        folder: for results.
+        option: that names it, for messages.
+
+    Raises:
+        UserInputError: it is a file or below one, it cannot be made, or it is not writable.
+    """
+    existing = str(folder)
+    # Not Path.exists, which raises where a name is too long for the file system.
+    while not os.path.lexists(existing):
+        if len(os.fsencode(os.path.basename(existing))) > LONGEST_NAME:  # noqa: PTH119
+            raise UserInputError(f"{option} {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
+        existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
+    if not is_folder(Path(existing)):
+        raise UserInputError(f"{option} {folder}: {existing} is a file; expected a folder, or a name for a new one")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise UserInputError(f"{option} {folder}: {existing} is not writable; choose another folder")
+    new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # root may write everywhere, but makes no folder in /proc
+    except OSError as error:
+        raise UserInputError(f"{option} {folder} cannot be made: {error.strerror}; choose another folder") from error
+    finally:
+        with suppress(OSError):  # not made, or another process uses it already
+            for path in new:
+                path.rmdir()
+
+
+def require_utf8(folder: Path, option: str) -> None:
+    """Refuse a folder whose path cannot be kept in JSON.
+
+    Raises:
+        UserInputError: as `require_place`.
+    """
+    try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise UserInputError(f"{option} {folder}: not UTF-8, as paths are kept; choose another folder") from error
 
 
 def _oldest(path: Path) -> int:

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, printable
 from lapgs_plugin.files import FolderLock, one_line_errors, require_own_entries, write_text
 from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
@@ -53,8 +53,8 @@ class RunFiles:
 
     @property
     def name(self) -> str:
-        """The name of the run folder."""
-        return self._absolute.name
+        """The name of the run folder, for pages and terminals: with control characters as escapes."""
+        return printable(self._absolute.name)
 
     @property
     def _folder(self) -> Path:

@@ -45,9 +45,9 @@ LEAST_PLACES = NEIGHBOURS + 1
 SAMPLED_POINTS, SAMPLED_VIEWS = 10_000, 100
 """Most points and views of which depths are measured."""
 EXTENT_MARGIN = 1.1
-FAR = 1e3
-"""Distance of the cameras from the origin, in extents, from which on positions are rounded to a tenth of a pixel of 1K
-images. Models in coordinates of a map are further away."""
+ROUNDED = 0.25
+"""Pixels to which positions may be rounded: from there on rounding shows. Models in coordinates of a map are further
+from the origin."""
 
 logger = logging.getLogger(__name__)
 
@@ -199,6 +199,7 @@ def load_scene(
             "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
             *(resolution, len(short), len(frames), max(short)),
         )
+    _warn_if_rounded(path, source.train, max(camera.fx for camera in cameras), source.points)
     behind = background if source.kind == "transforms" else None  # 3DGS ignores alpha of COLMAP scenes
 
     def load(posed: tuple[Frame, Camera]) -> View:
@@ -396,21 +397,36 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
         raise SceneError(
             f"{path}: all {len(train)} training cameras are at the same point, expected photos from different places"
         )
-    if (away := float(centers.mean(dim=0).norm())) > FAR * extent:
-        logger.warning(
-            "%s: the cameras are %.3g from the origin, %.3g times the scene's extent, where float32 numbers are %.1g "
-            "apart: fine detail is lost; move the model to the origin, for example with COLMAP's model_transformer",
-            *(path, away, away / extent, np.spacing(np.float32(away))),
-        )
     return extent
 
 
 def _unit(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
     """Return `Scene.unit`; 1 if no camera sees a point."""
+    return unit_of_depth(depth) if (depth := _median_depth(points, train)) else 1.0
+
+
+def _warn_if_rounded(path: Path, train: Sequence[Frame], focal: float, points: NDArray[np.float64]) -> None:
+    """Warn if float32 rounds positions to more than a part of a pixel: the model is far from the origin.
+
+    Args:
+        focal: the longest focal length of the views, in pixels.
+    """
+    depth = _median_depth(points, train) or _extent(path, train)  # made-up points may be elsewhere
+    away = float(torch.stack([frame.camera.position.norm() for frame in train]).median())
+    rounded = float(np.spacing(np.float32(away))) * focal / depth  # pixels
+    if rounded > ROUNDED:
+        logger.warning(
+            "%s: the cameras are %.3g from the origin, where float32 rounds positions to %.1g pixels: fine detail is "
+            "lost; move cameras and points to the origin, for example with COLMAP's model_transformer",
+            *(path, away, rounded),
+        )
+
+
+def _median_depth(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
+    """Return the median depth of points (n, 3) in the views that see them; 0 if none does."""
     some = some_of(torch.from_numpy(points))
     depths = [_depths_in_view(frame.camera, some) for frame in train[:: len(train) // SAMPLED_VIEWS + 1]]
-    median = float(torch.cat(depths).median()) if any(map(len, depths)) else 0.0
-    return unit_of_depth(median) if median > 0.0 else 1.0
+    return float(torch.cat(depths).median()) if any(map(len, depths)) else 0.0
 
 
 def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:

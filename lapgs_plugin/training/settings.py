@@ -246,7 +246,7 @@ class TrainSettings(HierarchySettings):
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
             raise UserInputError(f"--dropout {self.dropout}: expected a share from 0 to below 1, such as 0.2")
         if not 0.0 <= self.ssim_weight <= 1.0:
-            raise UserInputError(f"--ssim-weight {self.ssim_weight}: expected 0 (only L1) to 1 (only SSIM)")
+            raise UserInputError(f"ssim_weight is {self.ssim_weight}, expected 0 (only L1) to 1 (only SSIM)")
 
     def _choose_strategy(self) -> None:
         """Replace the strategy auto by the one that it means here.

@@ -14,6 +14,7 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.experiments.schema import load_experiment
+from lapgs_plugin.experiments.standard import EXPERIMENTS
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import CHECKOUTS
 
@@ -283,7 +284,7 @@ def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypat
     """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
     monkeypatch.setattr(bench_check, "_smallest_size", lambda scene, folder, resolution: (1600, 1066))
-    for path in sorted((Path(__file__).parents[2] / "benchmarks").glob("*.toml")):
+    for shipped, path in EXPERIMENTS.items():
         experiment = load_experiment(path, _option_names())
         names = {name for entry in experiment.scenes for name in entry.names}
         for name in names:
@@ -293,9 +294,9 @@ def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypat
                 link.symlink_to(scene)
         paths = [f"{name}={place / 'links' / name}" for name in names]
         paths += [f"{name}={CHECKOUTS / name}" for name in ("fastgs", "taming", "graphdeco")]
-        words = ["bench", str(path), "--dry-run", "--no-eval", *(word for p in paths for word in ("--path", p))]
+        words = ["bench", shipped, "--dry-run", "--no-eval", *(word for p in paths for word in ("--path", p))]
         result = CliRunner().invoke(app, words)
-        assert result.exit_code == 0, (path.name, str(result.exception))
+        assert result.exit_code == 0, (shipped, str(result.exception))
 
 
 def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(place: Path) -> None:

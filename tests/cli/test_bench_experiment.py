@@ -1,4 +1,4 @@
-"""Test `lapgs bench EXPERIMENT.toml` as users run it: to the end, again, with mistakes, and in parallel."""
+"""Test `lapgs bench EXPERIMENT` as users run it: to the end, again, with mistakes, and in parallel."""
 
 from __future__ import annotations
 

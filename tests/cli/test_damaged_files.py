@@ -89,6 +89,7 @@ MANIFEST_DAMAGE: list[tuple[str, Any, str]] = [
     ("records[0].level", 7, "finished levels .7, 0., expected .1, 0."),
     ("records[0].iterations", 0, "expected greater than 0"),
     ("records[0].num_gaussians", 10**18, "holds 250 Gaussians, the manifest says 1000000000000000000"),
+    ("records[0].mean_gaussians", 1e308, r"holds the number 1e\+308, expected finite numbers below 3\.4e\+38"),
     ("records[0].train_seconds", "long", "expected a valid number"),
     ("records[0].overhead_seconds", {"pyramid": "x"}, "expected a valid number"),
     ("records[0].image_size", [56], r"it lacks records\[0\]\.image_size\[1\]"),

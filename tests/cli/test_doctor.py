@@ -76,7 +76,7 @@ def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.Monkey
     assert "nothing until this is fixed" in result.stdout
 
 
-TORCH = {"version": "2.11.0", "cuda": "13.0", "gpus": [], "complaint": ""}
+TORCH = {"version": "2.11.0", "cuda": "13.0", "gpus": [], "complaint": "", "extensions": "/none"}
 GPU = "NVIDIA H200, 140 GiB"
 
 
@@ -123,3 +123,22 @@ def test_the_current_folder_is_a_checkout() -> None:
         ("", "not a"),
     ):
         assert current_folder(CHECKOUTS / folder, has_gpu=False).detail.startswith(message)
+
+
+@pytest.mark.parametrize("own_folder", [True, False])
+def test_what_gsplat_compiled_at_its_first_use_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own_folder: bool
+) -> None:
+    from torch.utils.cpp_extension import _get_build_directory
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "own"))
+    if not own_folder:
+        monkeypatch.delenv("TORCH_EXTENSIONS_DIR")
+    monkeypatch.setattr(findings, "gsplat_built", lambda: False)
+    torch = Probe({**probes.PROBES["torch"](), "gpus": [GPU]})
+    assert findings.gsplat_finding(torch, nvcc=True).detail.startswith("not built yet")
+    library = Path(_get_build_directory("gsplat_cuda", verbose=False), "gsplat_cuda.so")  # where gsplat builds it
+    library.touch()
+    assert findings.gsplat_finding(torch, nvcc=True).detail == f"built at its first use ({library})"
+    assert findings.gsplat_finding(torch, nvcc=False).status == "problem"  # gsplat does not load it then

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from rich.table import Table
+from typer.testing import CliRunner
 
 from lapgs_plugin.cli import prepare
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.output import make_console
 from lapgs_plugin.errors import MissingExtraError, UserInputError
+from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.training import backend
 from tests.cli.commands import succeeding
+from tests.cli.run_folder import write_run, write_scene
 
 WORDS = "word " * 40 + "end"
 
@@ -77,6 +81,7 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
         ("train empty -o runs/desk", "empty: neither a COLMAP model "),
         ("train desk -o full", "full is not empty and not a run "),
         ("train desk -o full/train.py/x", "--out full/train.py/x: full/train.py is a file; "),
+        ("train desk -o /proc/run", "--out /proc/run"),
         ("run --device cpu full/train.py", "full/train.py is not the training script "),
         ("eval runs/desk", "runs/desk does not exist, "),
         ("render empty", "empty has no manifest.json, "),
@@ -92,3 +97,31 @@ def test_messages_name_folders_as_they_were_typed(
     Path("full/train.py").write_text("import json\n")
     with pytest.raises(UserInputError, match=f"^{message}"):
         succeeding(app, 120)(*words.split())
+
+
+ODD = "r\x1b]0;title\x07\udcff[b]"
+"""A name with a control sequence, a byte that is no UTF-8, and markup of rich."""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "eval",
+        "export",
+        "export --html",
+        "render",
+        "report",
+        "report --baseline {run}",
+        "train {scene} --iterations 2 --levels 1 --overwrite -o",
+    ],
+)
+def test_names_reach_the_terminal_as_escapes_on_success_too(command: str, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "s\x1b[31m")
+    run = write_run(tmp_path / ODD, scene, levels=1)
+    name, *options = (word.format(run=run, scene=scene) for word in command.split(" "))
+    words = [name, str(run), *options] if name != "train" else [name, *options, str(run)]
+    result = CliRunner(charset="utf-8").invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert r"r\x1b]0;title\x07\udcff[b]" in result.output.replace("\n", "")
+    assert RunArchive.open(run).name == r"r\x1b]0;title\x07\udcff[b]"  # on pages, too
+    assert not re.search("[\x00-\x09\x0b-\x1f\udcff]", result.output)

@@ -280,6 +280,17 @@ def test_a_stopped_prepare_says_that_repeating_it_continues() -> None:
     assert done.stderr == "lapgs: stopped by Ctrl-C; scene keeps the finished steps, repeat the command to continue\n"
 
 
+def test_doctor_does_not_wait_for_the_programs_that_it_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/asked\nexec sleep 50\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    ended = signalled(["doctor"], [(0.1, signal.SIGTERM)], has_written(tmp_path, "asked"))
+    assert ended.code == 143, ended.text
+    assert ended.clean, ended.text
+    assert ended.seconds < 25  # seen 0.2, and 51 while the program was waited for
+
+
 CAMPAIGN = 150
 
 

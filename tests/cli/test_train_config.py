@@ -11,7 +11,7 @@ import torch
 from typer.testing import CliRunner
 
 from lapgs_plugin.cli.app import app
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
@@ -82,14 +82,30 @@ def test_a_run_on_large_photos_has_a_longer_base(
 def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: Path) -> None:
     run, words = tmp_path / "run", ("train", scene, "-o", tmp_path / "run", "--resume", "--iterations")
     lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)
-    for asked in (7, 8):
-        with pytest.raises(UserInputError, match=f"--iterations {asked}: the run in .* is finished with 8; give more"):
-            lapgs(*words, asked)
+    with pytest.raises(UserInputError, match=r"--iterations 7: the run in .* is finished with 8; give more"):
+        lapgs(*words, 7)
+    (run / "preview.jpg").unlink()  # as if it was killed after its last iteration
+    lapgs(*words, 8)
+    assert (run / "preview.jpg").exists()
     assert [read_toml(run / "run.toml")[name] for name in ("iterations", "strategy")] == [8, "auto"]
     lapgs(*words, 11, "--strategy", "auto")
     assert [read_toml(run / "run.toml")[name] for name in ("iterations", "strategy")] == [11, "3dgs"]
     settings = RunArchive.open(run).manifest.settings
     assert (settings["iterations"], settings["extended"]) == (11, 3)
+
+
+def test_a_settings_file_that_is_no_text_is_refused_before_a_run_is_extended(scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)
+    (run / "run.toml").write_bytes(b"iterations = 8\n#\xff\n")
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    extend = ("train", scene, "-o", run, "--resume", "--iterations", 11)
+    with pytest.raises(RunFolderError, match=r"run\.toml is not readable: byte 16 .* expected UTF-8 .* delete it"):
+        lapgs(*extend)
+    assert {path: path.read_bytes() for path in before} == before
+    (run / "run.toml").unlink()  # as the message advises
+    lapgs(*extend)
+    assert RunArchive.open(run).manifest.settings["iterations"] == 11
 
 
 def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path) -> None:
@@ -135,14 +151,29 @@ def test_files_of_older_versions_name_strategies_as_they_are_now(
         ('levels = "two"', "--levels two: expected a valid integer"),
         ("levels 2", "is not TOML"),
         ("joint = 2.0", "--joint 2"),
+        ('split = "1/2"', "--split has 1 shares"),
+        ('masks = "none/here"', "--masks none/here: no such folder"),
+        ('resolution = "tiny"', "--resolution 'tiny'"),
     ],
 )
 def test_a_mistake_in_the_file_is_one_line(scene: Path, tmp_path: Path, text: str, message: str) -> None:
     config = tmp_path / "mine.toml"
     config.write_text(text)
-    with pytest.raises(UserInputError, match=message):
+    with pytest.raises(UserInputError, match=f"^{config}.*{message}"):
         lapgs("train", scene, "--config", config, "-o", tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_only_values_of_the_file_are_said_to_be_of_it(scene: Path, tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text('scene = "gone"\njoint = 2.0\n')
+    for words, message in (
+        (["--joint", 3], "--joint 3"),
+        (["--joint", 0.5], f"{config}: gone: no such scene"),
+        ([scene, "--split", "1/2", "--joint", 0.5], "--split has 1 shares"),
+    ):
+        with pytest.raises(UserInputError, match=f"^{message}"):
+            lapgs("train", *words, "--config", config, "-o", tmp_path / "run")
 
 
 def test_a_file_that_is_not_there(scene: Path, tmp_path: Path) -> None:

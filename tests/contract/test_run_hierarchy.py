@@ -269,7 +269,9 @@ def noted(archive: RunArchive) -> list[tuple[int, int, set[str]]]:
     return [(entry["level"], entry["iteration"], set(entry)) for entry in archive.history()]
 
 
-def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(scene: Path, tmp_path: Path) -> None:
+def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """A run is stopped in both stages, and resumed once more when it is complete."""
     folder = tmp_path / "run"
 
@@ -282,7 +284,10 @@ def test_a_run_stopped_inside_stages_has_the_history_of_a_whole_one(scene: Path,
         with captured(folder, []), pytest.raises(KeyboardInterrupt):
             train(StopInside(level, iteration), resume=level == 0)
         assert noted(RunArchive.open(folder))[-1][:2] == (level, iteration), "entries that are to be dropped"
-    for archive in (train(), train()):
+    for finished in (False, True):
+        with caplog.at_level("INFO", "lapgs_plugin"):
+            archive = train()
+        assert (f"the run in {folder} is finished: nothing is left to train" in caplog.messages) == finished
         assert noted(archive) == whole
         elapsed = [entry["elapsed"] for entry in archive.history() if "elapsed" in entry]
         assert elapsed == sorted(elapsed)

@@ -320,6 +320,19 @@ def test_a_hierarchy_that_does_not_fit_the_scene(scene: Path, tmp_path: Path) ->
     one_line(caught.value)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a folder in /proc cannot be made")
+@pytest.mark.parametrize(
+    ("folder", "message"), [("/proc/run", "^-m /proc/run"), ("r\udcff", r"^-m r\\udcff: not UTF-8")]
+)
+def test_an_output_folder_that_cannot_be_used_is_refused_before_the_photos_are_read(
+    folder: str, message: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserInputError, match=message):
+        run_hierarchy(STUBS["graphdeco"], scene / "gone", Path(folder), *SHORT)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_two_runs_into_one_folder(scene: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     archive, _ = run_hierarchy(STUBS["graphdeco"], scene, folder, *SHORT)

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-SMOKE = Path(__file__).parents[2] / "benchmarks" / "smoke.toml"
+from lapgs_plugin.experiments.standard import EXPERIMENTS
+
+SMOKE = EXPERIMENTS["smoke"]
 
 
 SAMPLE = 'size = "240x160", views = 24, points = 2000'

@@ -82,6 +82,7 @@ RESUME = ("train", "{templates}/scene_json", "-o", "run_part", "--resume")
 REPORT = ("report", "run_done", *ORACLE)
 EXPORT = ("export", "run_done", "-o", "out")
 CLIP = ("render", "run_done", *ORACLE, "--trajectory", "path/trajectory.json", "-o", "clip")
+CONFIG = ("train", "{templates}/scene_json", "--config", "run_done/run.toml", *ORACLE, "-o", "run_new")
 TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
 
 
@@ -95,6 +96,8 @@ def _scene(name: str, target: str, damage: Damage, also: tuple[str, ...] = ()) -
 KINDS = (
     Kind("manifest", "run_done/manifest.json", JSON, [EXPORT, EXPORT, REPORT], [CLIP], also=["path"]),
     Kind("manifest to resume", "run_part/manifest.json", JSON, [RESUME]),
+    Kind("settings", "run_done/run.toml", TOML, [CONFIG]),
+    Kind("settings as text", "run_done/run.toml", _text, [CONFIG]),
     Kind("history", "run_done/history.jsonl", damaged_lines, [REPORT]),
     Kind("history to resume", "run_part/history.jsonl", damaged_lines, [RESUME]),
     Kind("metrics", "run_done/metrics.json", JSON, [REPORT]),

@@ -36,7 +36,7 @@ class Again(str):
 DEEP = 200_000
 LONG_NUMBER = "9" * 5_000
 NUMBERS: tuple[Any, ...] = (
-    *(0, -1, 1, 2, 7, -5, 99, 10**9, -(10**9), 2**31, 2**63, 10**30, 0.5, -0.25, 1e-300, 1e300, -1e18),
+    *(0, -1, 1, 2, 7, -5, 99, 10**9, -(10**9), 2**31, 2**63, 10**30, 0.5, -0.25, 1e-300, 1e300, 1e308, -1e18),
     *(Raw("NaN"), Raw("Infinity"), Raw("-Infinity"), Raw("1e999"), Raw(LONG_NUMBER), Raw("-" + LONG_NUMBER)),
 )
 TEXTS: tuple[Any, ...] = (

@@ -36,8 +36,7 @@ from lapgs_plugin.experiments.rows import result_row
 from lapgs_plugin.experiments.schema import load_experiment
 from lapgs_plugin.experiments.settings import Selection
 from lapgs_plugin.experiments.store import ResultStore
-from lapgs_plugin.files import BARE_RECORD
-from lapgs_plugin.patching.recipe import patches_folder
+from lapgs_plugin.files import BARE_RECORD, shipped
 from lapgs_plugin.runner.imported import BREAKDOWN, CFG_ARGS, TRAIN_INFO
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.images import write_image
@@ -68,7 +67,7 @@ def make_templates(folder: Path, reader: Reader) -> Path:
     _write_ascii_field(folder)
     _write_foreign(folder)
     _write_experiment(folder, reader)
-    shutil.copytree(patches_folder(), folder / "recipes")
+    shutil.copytree(shipped("patches"), folder / "recipes")
     pillow_heif.register_heif_opener()
     for suffix in ("heic", "webp"):
         (folder / "phone").mkdir(exist_ok=True)

@@ -17,7 +17,7 @@ GPU = "NVIDIA H100, 80 GiB, compute capability 9.0"
 
 
 def torch_probe(cuda: str | None = None, gpus: tuple[str, ...] = (), complaint: str = "") -> Probe:
-    return Probe({"version": "2.6.0", "cuda": cuda, "gpus": list(gpus), "complaint": complaint})
+    return Probe({"version": "2.6.0", "cuda": cuda, "gpus": list(gpus), "complaint": complaint, "extensions": "none"})
 
 
 def status(found: list[Finding]) -> dict[str, str]:

@@ -270,7 +270,7 @@ def test_a_message_names_the_place_what_was_expected_and_that_nothing_happened(t
     assert f"kernels/shade.cu:{line}: expected `result += 0.5f;` once in shade but found it nowhere" in message
     assert "signed/raw" in message
     assert message.endswith(
-        "; nothing was changed; a rasterizer that differs needs a recipe of its own, see patches/README.md"
+        "; nothing was changed; a rasterizer that differs needs a recipe of its own, see `lapgs help patches`"
     )
     assert "\n" not in message
 
@@ -883,7 +883,7 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
         ('name = "new"\ntitle = "New"', "it lacks present"),
         ('name = "old"\ntitle = "New"\npresent = []', "its name is 'old', expected that of the file"),
         ('name = "new"\ntitle = "New"\npresent = []\nextends = "old"', "extends 'old', expected one of"),
-        ('name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"', "README"),
+        ('name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"', "lapgs help patches"),
         (
             'name = "new"\ntitle = "New"\npresent = []\n'
             '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',

@@ -519,17 +519,29 @@ def test_absolute_names_and_far_cameras_work(tmp_path: Path) -> None:
     assert scene.train[0].camera.position[0].item() == pytest.approx(1e6)
 
 
-@pytest.mark.parametrize(("away", "warned"), [(1e3, False), (5e5, True)])
+@pytest.mark.parametrize(
+    ("away", "radius", "points_away", "warned"),
+    [
+        (1e3, NERF_RADIUS, 0.0, False),
+        (5e5, NERF_RADIUS, 0.0, True),  # the made-up points are not there
+        (1.0, 1e-4, 4.0, False),  # photos from nearly one point, of something 4 away: numbers are 1e-7 apart
+        (1e6, NERF_RADIUS, 1e3, False),  # a mountain range
+        (1e6, NERF_RADIUS, 4.0, True),
+    ],
+)
 def test_coordinates_of_a_map_are_told(
-    tmp_path: Path, away: float, warned: bool, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, away: float, radius: float, points_away: float, warned: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = capture(tmp_path)
-    for i, eye in enumerate(eyes(10)):
-        there = np.array([away, 0.0, 0.0])
-        edit(path, {"transform_matrix": look_at(eye + there, tuple(there)).tolist()}, in_frame=i)
+    path, there = capture(tmp_path), np.array([away, 0.0, 0.0])
+    for i, eye in enumerate(eyes(10, radius)):
+        target = there + np.array([0.0, 0.0, points_away])
+        edit(path, {"transform_matrix": look_at(eye + there, tuple(target)).tolist()}, in_frame=i)
+    if points_away:
+        cloud = target + np.random.default_rng(0).normal(size=(50, 3)) * points_away / 10
+        write_ply(path / "points.ply", cloud, np.zeros((50, 3), np.uint8))
+        edit(path, {"ply_file_path": "points.ply"})
     load(path)
-    assert ("the cameras are 5e+05 from the origin" in caplog.text) == warned
-    assert ("numbers are 0.03 apart" in caplog.text) == warned
+    assert (f"the cameras are {away:.3g} from the origin, where float32 rounds" in caplog.text) == warned
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ UNREADABLE_JSON = [
     (b"1" * 5_000, "is not readable as JSON|holds the number"),
     (b"1" * 30, "holds the number 1{30}, expected 64 bits"),
     (b"[1e999]", "holds the number inf, expected finite"),
+    (b"[-1e39]", r"holds the number -1e\+39, expected finite numbers below 3\.4e\+38"),
     (b"NaN", "is not readable as JSON"),
     (b"[-Infinity]", "is not readable as JSON"),
     (b'"\xff"', "is not readable as JSON"),
