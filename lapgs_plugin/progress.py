@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from datetime import timedelta
@@ -16,15 +17,16 @@ from rich.progress import (
     Task,
     TaskID,
     TextColumn,
-    TimeRemainingColumn,
 )
 from rich.text import Text
 
 from lapgs_plugin.errors import printable_lines
 
 LEAST_SECONDS, MOST_SECONDS, STEP = 10.0, 60.0, 0.05
-"""Outside of a terminal a line is printed at every `STEP` of the work and at least every `MOST_SECONDS`, but not more
-often than every `LEAST_SECONDS`."""
+"""Outside of a terminal the first line is printed after `LEAST_SECONDS`, then one at every `STEP` of the work and at
+least every `MOST_SECONDS`, but not more often than every `LEAST_SECONDS`."""
+AVERAGED_SECONDS = 3600.0
+"""Time over which the rate of items is averaged. In shorter times it jumps, because items differ."""
 
 
 class EscapingConsole(Console):
@@ -48,12 +50,12 @@ class LoggingProgress(Progress):
         # The thread with which rich refreshes a bar, and counts in `track`, ends at once where no bar is shown.
         super().__init__(*columns, console=console, disable=not shown, auto_refresh=shown, **options)
         self._unit = unit
-        self._printed: dict[TaskID, tuple[float, float]] = {}  # when, and completed items
+        self._printed: dict[TaskID, tuple[float, float]] = {}  # when, and completed items; before the first line -inf
 
     def add_task(self, *arguments: Any, **options: Any) -> TaskID:
         """Add a task as rich does."""
         task = super().add_task(*arguments, **options)
-        self._printed[task] = time.monotonic(), self._tasks[task].completed
+        self._printed[task] = time.monotonic(), -math.inf
         return task
 
     def update(self, task_id: TaskID, **options: Any) -> None:
@@ -66,19 +68,30 @@ class LoggingProgress(Progress):
         super().advance(task_id, advance)
         self._print_if_due(task_id)
 
+    def stop(self) -> None:
+        """Stop as rich does, and print a line about work that ends with items left."""
+        super().stop()
+        for task_id, (_, done) in self._printed.items():
+            if self.disable and self._tasks[task_id].total and done < self._tasks[task_id].completed:
+                self._print(task_id)
+
     def _print_if_due(self, task_id: TaskID) -> None:
         if not self.disable:
             return
-        task, now = self._tasks[task_id], time.monotonic()
+        task = self._tasks[task_id]
         since, done = self._printed[task_id]
         if task.finished:
             due = done < task.completed
         else:
-            passed, moved = now - since, task.completed - done
+            passed, moved = time.monotonic() - since, task.completed - done
             due = passed >= MOST_SECONDS or (passed >= LEAST_SECONDS and moved >= STEP * (task.total or 0))
         if due:
-            self._printed[task_id] = now, task.completed
-            self.console.print(" ".join(self._words(task)), highlight=False, markup=False, soft_wrap=True)
+            self._print(task_id)
+
+    def _print(self, task_id: TaskID) -> None:
+        task = self._tasks[task_id]
+        self._printed[task_id] = time.monotonic(), task.completed
+        self.console.print(" ".join(self._words(task)), highlight=False, markup=False, soft_wrap=True)
 
     def _words(self, task: Task) -> Iterable[str]:
         """Yield the parts of a line about a task."""
@@ -88,10 +101,25 @@ class LoggingProgress(Progress):
         figures, rate = str(task.fields.get("figures") or ""), task.finished_speed or task.speed
         if rate and not figures:
             yield f"{rate:.1f} a second" if rate >= 1.0 else f"{1.0 / rate:.1f} s each"
-        if task.time_remaining:
-            yield f"{timedelta(seconds=round(task.time_remaining))} left"
+        if left := seconds_left(task):
+            yield f"{timedelta(seconds=round(left))} left"
         if figures:
             yield figures
+
+
+def seconds_left(task: Task) -> float | None:
+    """Return the seconds that a task still takes: by its rate, or before rich has one, by its first items."""
+    if task.time_remaining is not None or not task.completed or not task.elapsed or task.remaining is None:
+        return task.time_remaining
+    return task.remaining * task.elapsed / task.completed
+
+
+class TimeLeftColumn(ProgressColumn):
+    """Show the time that is left."""
+
+    def render(self, task: Task) -> Text:
+        left = seconds_left(task)
+        return Text("-:--:--" if left is None else str(timedelta(seconds=round(left))), style="progress.remaining")
 
 
 class RateColumn(ProgressColumn):
@@ -115,7 +143,8 @@ def item_progress(unit: str) -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         RateColumn(unit),
-        TimeRemainingColumn(),
+        TimeLeftColumn(),
         console=EscapingConsole(stderr=True),
         unit=unit,
+        speed_estimate_period=AVERAGED_SECONDS,
     )
