@@ -135,6 +135,7 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
     from rich.markup import escape
 
     from lapgs_plugin.evaluation.lpips import lpips_titles
+    from lapgs_plugin.evaluation.metrics import far_worse_below
 
     measured = lpips_titles(metrics)
     table = make_table("view", "PSNR (dB)", "colour-fitted", "SSIM", *measured.values())
@@ -145,6 +146,16 @@ def _print_views(console: Console, metrics: dict[str, Any]) -> None:
         table.add_row(escape(printable(view["name"])), *figures, *distances)
     more = f", {len(ranked) - SHOWN_VIEWS} better ones are in metrics.json" if len(ranked) > SHOWN_VIEWS else ""
     console.print(f"[bold]Views, worst first[/bold]{more}", table)
+    limit = far_worse_below([float(view["psnr"]) for view in ranked])
+    if far := [str(view["name"]) for view in ranked if view["psnr"] < limit]:
+        more = f" and {len(far) - SHOWN_VIEWS} more" if len(far) > SHOWN_VIEWS else ""
+        console.print(
+            f"{len(far)} of {counted(len(ranked), 'view')} are far worse than the rest, below {limit:.1f} dB: "
+            f"{printable(', '.join(far[:SHOWN_VIEWS]))}{more}; their cameras may be placed wrongly, or no training "
+            "view shows the same",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def _print_levels(console: Console, metrics: dict[str, Any]) -> None:

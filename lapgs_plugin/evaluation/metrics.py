@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from statistics import fmean
+from statistics import fmean, median
 
 import torch
 from torch import Tensor
@@ -14,6 +14,9 @@ from lapgs_plugin.ops.photometric_loss import in_torch
 
 LITTLE = 1e-6
 """Weight of the identity in a colour fit, relative to that of the pixels."""
+FAR_WORSE, SPREADS = 6.0, 4.5
+"""Fewest dB below the median at which an image is far worse than the rest: twice the error; and as a multiple of the
+median distance of the better half from the median: three standard deviations of a normal distribution."""
 SMALLEST_MSE = 1e-10
 """Smallest mean squared error that counts, near the resolution of float32 images; it bounds PSNR."""
 
@@ -32,6 +35,12 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def psnr_of(mse: float) -> float:
     """Return the peak signal-to-noise ratio in dB of a mean squared error of intensities in [0, 1], at most 100."""
     return -10.0 * math.log10(max(mse, SMALLEST_MSE))
+
+
+def far_worse_below(psnrs: Sequence[float]) -> float:
+    """Return the PSNR in dB below which an image is far worse than the rest. The worse half does not move it."""
+    middle = median(psnrs)
+    return middle - max(FAR_WORSE, SPREADS * median(value - middle for value in psnrs if value >= middle))
 
 
 @torch.no_grad()

@@ -10,7 +10,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
+from lapgs_plugin.cli.evaluate import _print_views
 from lapgs_plugin.evaluation.metrics import mean_quality, psnr, ssim
 
 
@@ -72,3 +74,31 @@ def test_means_over_images_are_of_each_images_own_figures() -> None:
     assert means["psnr"] == pytest.approx(sum(psnr(*pair) for pair in pairs) / 3)
     assert means["ssim"] == pytest.approx(sum(ssim(*pair) for pair in pairs) / 3)
     assert mean_quality([]) == {}
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "far"),
+    [
+        ([22.1, 21.5, 11.0, 23.0, 22.4, 20.9], [2]),
+        ([22.1, 11.5, 11.0, 23.0, 22.4], [1, 2]),  # two of five photos were placed wrongly
+        ([30.0, 24.1, 29.0, 31.0, 28.0, 33.0], []),  # scenes differ from view to view
+        ([22.0, 22.0, 22.0, 16.1], []),
+        ([22.0, 22.0, 22.0, 15.9], [3]),
+        ([30.0, 11.0], []),
+        ([20.0], []),
+    ],
+)
+def test_views_that_are_far_worse_than_the_rest_are_named(
+    psnrs: list[float], far: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [
+        {"name": f"view {index}[b]\x1b.png", "psnr": value, "fitted_psnr": 20.0, "ssim": 0.5}
+        for index, value in enumerate(psnrs)
+    ]
+    _print_views(Console(width=100), {"views": views, "lpips_missing": {}})
+    lines = [line for line in capsys.readouterr().out.splitlines() if "far worse than the rest" in line]
+    assert len(lines) == bool(far)
+    if far:
+        assert f"{len(far)} of {len(psnrs)} views are far worse than the rest" in lines[0]
+        named = {index for index in range(len(psnrs)) if rf"view {index}[b]\x1b.png" in lines[0]}
+        assert named == set(far)
