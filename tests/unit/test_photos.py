@@ -157,9 +157,11 @@ def _stopping_before_colmap(photos: Path, out: Path, monkeypatch: pytest.MonkeyP
             prepare_scene(photos, out, PrepareSettings(**options), progress=False)
 
 
-def _write_clip(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
+def _write_clip(path: Path, frames: list[NDArray[np.uint8]], *options: str) -> Path:
     height, width = frames[0].shape[:2]
-    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=10, quality=10, macro_block_size=1)
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=10, quality=10, macro_block_size=1, output_params=list(options)
+    )
     writer.send(None)
     for frame in frames:
         writer.send(np.ascontiguousarray(frame).tobytes())
@@ -202,6 +204,37 @@ def test_hdr_videos_of_phones_are_read(tmp_path: Path) -> None:
     written = cv2.imread(str(tmp_path / "frame_000003.jpg"))[..., ::-1].astype(np.float64)
     errors = [np.abs(written - frame).mean() for frame in frames]
     assert errors[3] < 20 < min(errors[:3])  # seen 5.9, and 82.7 of other frames
+
+
+@pytest.mark.parametrize(("pixel", "width"), [("3/8", 36), ("4/3", 128), ("1/1", 96)])
+def test_frames_get_square_pixels(tmp_path: Path, pixel: str, width: int) -> None:
+    frames = [WALL[:64, 12 * index : 12 * index + 96] for index in range(4)]
+    video = _write_clip(tmp_path / "phone.mp4", frames, "-vf", f"setsar={pixel}")
+    assert len(pick_frames(video, 4, lambda done, total: None)) == 4
+    write_frames(video, [3], tmp_path, lambda done, total: None)
+    written = cv2.imread(str(tmp_path / "frame_000003.jpg"))[..., ::-1].astype(np.float64)
+    assert written.shape == (64, width, 3)
+    expected = cv2.resize(frames[3], (width, 64), interpolation=cv2.INTER_AREA)
+    assert np.abs(written - expected).mean() < 30  # seen 15.6, and 79.8 of other frames
+
+
+def test_a_clip_whose_size_changes_is_one_line_and_its_parts_are_read(tmp_path: Path) -> None:
+    """Parts of MPEG transport streams make a stream when one is put behind the other."""
+    frames = [WALL[:64, 12 * index : 12 * index + 96] for index in range(6)]
+    parts = [
+        _write_clip(tmp_path / "wide.ts", frames),
+        _write_clip(tmp_path / "tall.ts", [np.rot90(frame) for frame in frames]),
+    ]
+    both = tmp_path / "both.ts"
+    both.write_bytes(b"".join(part.read_bytes() for part in parts))
+    with pytest.raises(
+        SceneError, match=r"both\.ts: .* changes from 96x64 to 64x96 pixels, expected one size"
+    ) as caught:
+        prepare_scene(both, tmp_path / "scene", progress=False)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "scene").exists()
+    for part in parts:  # as the message advises
+        assert len(pick_frames(part, 3, lambda done, total: None)) == 3
 
 
 def test_frames_where_the_camera_stands_still_are_left_out() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,6 +24,8 @@ JUDGED_WIDTH = 640
 """Width at which sharpness and motion are judged."""
 BLOCK = 8
 """Side of the squares whose means are compared for motion, so that noise does not count."""
+SQUARE = "scale='max(1,round(iw*sar))':ih,setsar=1"
+"""FFmpeg's filter that makes pixels square, as players show them."""
 STILL = 1.5
 """Mean difference, in grey levels of 255, below which the camera has not moved between two frames."""
 
@@ -102,13 +105,23 @@ def write_frames(clip: Path, numbers: list[int], folder: Path, seen: Callable[[i
 
 
 def _frames(clip: Path, pixels: str, filters: str) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames (h, w, c) of a clip after FFmpeg's filters, upright; `pixels` is "pgm" (grey) or "ppm" (RGB)."""
+    """Yield the frames (h, w, c) of a clip after FFmpeg's filters, upright, with square pixels.
+
+    Args:
+        clip: the video.
+        pixels: "pgm" for grey or "ppm" for RGB.
+        filters: of FFmpeg.
+
+    Raises:
+        SceneError: no frame can be decoded, or the size changes, which also makes FFmpeg count frames anew.
+    """
     import imageio_ffmpeg
 
     depth = "rgb24" if pixels == "ppm" else "gray"  # else phones' HDR videos of 10 bits become 16-bit images
-    options = ["-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough", "-pix_fmt", depth]
+    chain = f"showinfo=checksum=0,{SQUARE},{filters}"  # the first of these tells the size of each frame
+    options = ["-map", "0:v:0", "-vf", chain, "-fps_mode", "passthrough", "-pix_fmt", depth]
     options += ["-f", "image2pipe", "-c:v", pixels, "-"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-i", str(clip), *options]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "info", "-nostats", "-nostdin", "-i", str(clip), *options]
     with tempfile.TemporaryFile() as words, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=words) as ffmpeg:
         assert ffmpeg.stdout is not None
         try:
@@ -123,6 +136,16 @@ def _frames(clip: Path, pixels: str, filters: str) -> Iterator[NDArray[np.uint8]
                     yield np.frombuffer(frame, np.uint8).reshape(height, width, channels)
         finally:
             ffmpeg.kill()
+        words.seek(0)
+        text = words.read().decode(errors="replace")
+    sizes = list(dict.fromkeys(re.findall(r" s:(\d+x\d+) ", text)))
+    if len(sizes) > 1:
+        raise SceneError(
+            f"{clip}: the size of its frames changes from {sizes[0]} to {sizes[1]} pixels, expected one size; cut it "
+            "there and give one of the parts"
+        )
+    if not sizes:
+        raise _undecodable(clip, text)
 
 
 def _length(clip: Path) -> tuple[int, float]:
@@ -138,14 +161,14 @@ def _length(clip: Path) -> tuple[int, float]:
     try:
         frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(clip))
     except RuntimeError as error:
-        raise SceneError(
-            f"{clip}: the video cannot be decoded ({_reason(str(error))}); expected a clip that a player shows, "
-            "copy or convert it again"
-        ) from error
+        raise _undecodable(clip, str(error)) from error
     return int(frames), float(seconds)
 
 
-def _reason(text: str) -> str:
-    """Return the line of FFmpeg's output that says why it failed."""
+def _undecodable(clip: Path, text: str) -> SceneError:
+    """Return the error about a clip, with the line of FFmpeg's output that says why it failed."""
     lines = [line.strip() for line in text.splitlines() if line.strip(" =")]
-    return next((line for line in reversed(lines) if "rror" in line or "nvalid" in line), "no reason given")
+    reason = next((line for line in reversed(lines) if "rror" in line or "nvalid" in line), "no reason given")
+    return SceneError(
+        f"{clip}: the video cannot be decoded ({reason}); expected a clip that a player shows, copy or convert it again"
+    )
