@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 import subprocess
@@ -286,6 +287,29 @@ def test_few_features_are_mapped_by_one_thread(
     job = {"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed"), "mapper": "incremental"}
     colmap_worker._map(job)
     assert used == [threads]
+
+
+def test_colmap_leaves_no_log_files(tmp_path: Path, prepared: tuple[Path, PrepareResult]) -> None:
+    assert pycolmap.logging.logtostderr, "this process writes them, too"
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    pycolmap.Database.open(tmp_path / "database.db").close()
+    job = {"step": "pairs", "database": str(tmp_path / "database.db"), "matcher": "exhaustive"}
+    worker = subprocess.Popen(
+        [sys.executable, str(colmap.WORKER)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"TMPDIR": str(temporary)},
+    )
+    assert worker.stdin is not None
+    assert worker.stderr is not None
+    worker.stdin.write(json.dumps(job).encode() + b"\n")
+    worker.stdin.flush()
+    assert worker.wait() == 0
+    assert b"Feature matching" in worker.stderr.read()
+    worker.stdin.close()
+    worker.stderr.close()
+    assert list(temporary.iterdir()) == []
 
 
 @pytest.fixture

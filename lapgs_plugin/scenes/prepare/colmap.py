@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ import pycolmap
 
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.scenes.output import check_written
+from lapgs_plugin.scenes.parallel import ProgressCallback
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRIEVAL, SEQUENTIAL, PrepareSettings
 
@@ -37,7 +38,11 @@ the camera may come back to a place."""
 DEFAULT_MODEL = "OPENCV"
 """Camera model that "auto" fits first."""
 
+GLOBAL_STEPS = 5
+"""Steps that the global mapper says it runs."""
+
 POLL_SECONDS = 0.2
+LOG = "colmap.log"
 WORKER = Path(__file__).with_name("colmap_worker")
 
 
@@ -74,23 +79,24 @@ def find_features(job: Job, single_camera: bool) -> None:
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
     _run_step(
-        *(job, "Finding features", "photos", len(job.names), "features", options),
-        lambda: _rows(job.database, "descriptors"),
+        *(job, "features", options),
+        [Phase("Finding features", "photos", len(job.names), lambda: _rows(job.database, "descriptors"))],
     )
 
 
 def match_pairs(job: Job) -> None:
     """Match the features of those pairs of photos that the matcher chooses."""
-    count, loops = len(job.names), _loops(job)
+    count, loops, matcher = len(job.names), _loops(job), chosen_matcher(job)
     total = {
         EXHAUSTIVE: count * (count - 1) // 2,
         SEQUENTIAL: _neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
         RETRIEVAL: count * min(SIMILAR, count - 1),  # at most: many pairs are found from both sides
-    }[chosen_matcher(job)]
-    _run_step(
-        *(job, "Matching pairs", "pairs", total, "pairs", _pairing(job)),
-        lambda: _rows(job.database, "two_view_geometries"),
-    )
+    }[matcher]
+    phases = [Phase("Matching pairs", "pairs", total, lambda: _rows(job.database, "two_view_geometries"))]
+    if matcher == RETRIEVAL or (matcher == SEQUENTIAL and loops):
+        indexed = re.compile(rb"Indexing image \[(\d+)/")
+        phases.insert(0, Phase("Comparing photos", "photos", count, lambda: _logged(job, indexed)))
+    _run_step(job, "pairs", _pairing(job), phases)
 
 
 def match_more(job: Job) -> Path | None:
@@ -114,8 +120,8 @@ def match_more(job: Job) -> Path | None:
         before = _rows(partial, "two_view_geometries")
         options = {**_pairing(job), "database": str(partial.absolute()), "guided": True}
         _run_step(
-            *(job, "Matching more", "pairs", total, "pairs", options),
-            lambda: _rows(partial, "two_view_geometries") - before,
+            *(job, "pairs", options),
+            [Phase("Matching more", "pairs", total, lambda: _rows(partial, "two_view_geometries") - before)],
         )
         with closing(sqlite3.connect(partial)) as connection:
             # COLMAP leaves matches in its log if the progress bar reads the database while COLMAP closes it.
@@ -189,7 +195,12 @@ def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
             other = job.work / "simple.db"
             _copy(attempt.database or job.database, other)
             options |= {"database": str(other.absolute()), "camera_model": attempt.lens}
-        _run_step(job, attempt.title, "photos", len(job.names), "map", options, lambda: placed.stat().st_size)
+        if options["mapper"] == GLOBAL:
+            running = re.compile(rb"=== Running ()")
+            phase = Phase(attempt.title, "steps", GLOBAL_STEPS, lambda: max(0, _logged(job, running) - 1))
+        else:
+            phase = Phase(attempt.title, "photos", len(job.names), lambda: _most_placed(placed), complete=False)
+        _run_step(job, "map", options, [phase])
         for written in unfinished.iterdir():
             check_written(written)
         unfinished.rename(folder)
@@ -206,18 +217,45 @@ def _rows(database: Path, table: str) -> int:
         return 0
 
 
-def _run_step(
-    job: Job, title: str, unit: str, total: int, step: str, options: dict[str, Any], done: Callable[[], int]
-) -> None:
-    """Run a step of `colmap_worker` with a progress bar. An interruption stops it at once.
+def _logged(job: Job, pattern: re.Pattern[bytes]) -> int:
+    """Return the last number that a pattern finds in COLMAP's log, or how often it is found if it has no number."""
+    with suppress(OSError):
+        numbers = pattern.findall((job.work / LOG).read_bytes())
+        return int(numbers[-1] or len(numbers)) if numbers else 0
+    return 0
+
+
+def _most_placed(file: Path) -> int:
+    """Return the number of photos in the largest model so far: a line for each model, a byte for each photo."""
+    return max(map(len, file.read_bytes().split(b"\n")))
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Describe a progress bar of a step of `colmap_worker`.
+
+    Attributes:
+        title, unit, total: of the bar.
+        done: returns how many items are finished.
+        complete: whether all are when the step succeeds.
+    """
+
+    title: str
+    unit: str
+    total: int
+    done: Callable[[], int]
+    complete: bool = True
+
+
+def _run_step(job: Job, step: str, options: dict[str, Any], phases: Sequence[Phase]) -> None:
+    """Run a step of `colmap_worker` with a progress bar for each phase. An interruption stops it at once.
 
     Raises:
         LapgsError: it failed, with COLMAP's last error.
     """
     order = json.dumps({"step": step, "database": str(job.database.absolute()), **options})
-    log = job.work / "colmap.log"
-    with job.timed(title), job.bar(title, unit) as seen, log.open("wb") as words:
-        seen(0, total)
+    title, log = phases[-1].title, job.work / LOG
+    with job.timed(title), log.open("wb") as words:
         command = [sys.executable, str(WORKER)]
         worker = subprocess.Popen(
             command, bufsize=0, stdin=subprocess.PIPE, stdout=words, stderr=words, start_new_session=True
@@ -226,21 +264,31 @@ def _run_step(
         try:
             with suppress(BrokenPipeError):  # reported by its exit code
                 worker.stdin.write(order.encode() + b"\n")
-            while worker.poll() is None:
-                with suppress(subprocess.TimeoutExpired):
-                    worker.wait(POLL_SECONDS)
-                seen(min(done(), total - 1), total)  # COLMAP goes on after its last item
+            for phase in phases:
+                with job.bar(phase.title, phase.unit) as seen:
+                    _show_phase(worker, phase, seen, last=phase is phases[-1])
         finally:
             worker.kill()
             worker.wait()
             worker.stdin.close()
-        if worker.returncode == 0:
-            seen(total, total)
     if worker.returncode != 0:
         raise LapgsError(
             f"{job.work.parent}: COLMAP failed at {title.lower()} ({_last_words(log, worker.returncode)}); check free "
             f"space and memory, then repeat the command to continue, or remove {job.work} to start over"
         )
+
+
+def _show_phase(worker: subprocess.Popen[bytes], phase: Phase, seen: ProgressCallback, last: bool) -> None:
+    """Show the progress of a phase until it, or the last one's process, ends."""
+    total, done = phase.total, phase.done()
+    seen(done, total)
+    while worker.poll() is None and (last or done < total):
+        with suppress(subprocess.TimeoutExpired):
+            worker.wait(POLL_SECONDS)
+        done = max(done, phase.done())  # a database that is busy tells nothing
+        seen(min(done, total - 1), total)  # COLMAP goes on after its last item
+    if not worker.returncode:
+        seen(total if phase.complete else min(max(done, phase.done()), total), total)
 
 
 def _last_words(log: Path, code: int) -> str:

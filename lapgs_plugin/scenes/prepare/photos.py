@@ -153,8 +153,8 @@ def camera_of(photo: Path) -> tuple[str, ...]:
     return ("",) * 4
 
 
-def quarter_turns(photo: Path) -> int:
-    """Return the quarter turns clockwise that make a photo upright by EXIF; 0 where it does not tell, or mirrors."""
+def quarter_turns(photo: Path) -> int | None:
+    """Return the quarter turns clockwise that make a photo upright by EXIF; None where it does not tell, or mirrors."""
     with suppress(Exception), Image.open(photo) as opened:  # as above
-        return {6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 1), 0)
-    return 0
+        return {1: 0, 6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 0))
+    return None

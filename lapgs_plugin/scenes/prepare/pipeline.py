@@ -79,6 +79,7 @@ def prepare_scene(
         LapgsError: the disk is full, the folder cannot be written, or COLMAP failed.
         MissingExtraError: a package that reads videos or HEIC photos is missing.
     """
+    pycolmap.logging.logtostderr = True  # and not to files in /tmp as well
     settings = settings or PrepareSettings()
     _check_folders(photos, out, settings, overwrite)
     if (place := find_given(photos, settings)) is not None:

@@ -3,129 +3,175 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from dataclasses import dataclass
 
-import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from lapgs_plugin.errors import SceneError
+from lapgs_plugin.errors import SceneError, counted
 from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, Attempt, map_photos, match_more
 from lapgs_plugin.scenes.prepare.job import Job
+from lapgs_plugin.scenes.prepare.photos import listed, quarter_turns
 from lapgs_plugin.scenes.prepare.settings import AUTO, GLOBAL, INCREMENTAL
+from lapgs_plugin.scenes.prepare.view_graph import (
+    ROLLED,
+    Seam,
+    find_seam,
+    placed_images,
+    remove_unlinked,
+    rolled_images,
+)
 
 SIMPLE_MODEL = "SIMPLE_RADIAL"
 """Camera model that is fitted if the result with the first one is doubtful."""
 FEW = 0.75
 """Share of photos below which so few are placed that another attempt may place more."""
-LINKED = 15
-"""Fewest points that two photos share if one's place says where the other is, as in COLMAP's mapper."""
 SQUARE = 0.04
 """Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
+EXACT, INEXACT = 0.1, 1.0
+"""Reprojection errors in pixels: no feature is found better than the first; above the second the lens is doubtful."""
+SAME_ERROR = 1.02
+"""Ratio of reprojection errors up to which they are the same: a lens with fewer parameters fits noise less."""
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Hold the models of an attempt and what was wrong with them.
+
+    Attributes:
+        models: the one with most photos first, without photos whose place is arbitrary.
+        seams: where a model was cut, a sentence each.
+    """
+
+    models: list[pycolmap.Reconstruction]
+    seams: tuple[str, ...] = ()
+
+    @property
+    def photos(self) -> int:
+        """Number of photos in the largest model."""
+        return self.models[0].num_reg_images() if self.models else 0
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error of the largest model in pixels, `EXACT` at least."""
+        return max(self.models[0].compute_mean_reprojection_error() if self.models else 0.0, EXACT)
+
+    def is_better_than(self, other: Placement) -> bool:
+        """Return whether this attempt is to be kept: twice the photos outweigh four times the error."""
+        if self.photos == other.photos:
+            return self.error < other.error
+        return self.photos**2 * other.error > other.photos**2 * self.error
 
 
 def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
     """Recover the models and return them, the one with most photos first.
 
-    If the default camera model places few photos or gives focal lengths that no lens has, place the cameras again with
-    a simpler one.
+    If the default camera model places few photos, gives focal lengths that no lens has, or glues groups of photos
+    together, place the cameras again with a simpler one.
 
     Raises:
         SceneError: no photo could be placed.
     """
-    models = _mapped(job, Attempt("Placing cameras", "models"))
-    if (doubt := _doubt(job, models)) is not None:
+    placement = _placed(job, Attempt("Placing cameras", "models"))
+    if (doubt := _doubt(job, placement)) is not None:
         if job.settings.camera_model != AUTO:
             logger.warning("%s; leave out --camera-model %s, or choose SIMPLE_RADIAL", doubt, job.settings.camera_model)
         else:
-            models = _placed_again(job, models, doubt)
-    if _placed(models) < 2:
+            placement = _placed_again(job, placement, doubt)
+    if placement.photos < 2:
         raise SceneError(
             f"{job.found.clip or job.found.folder}: none of the {len(job.names)} photos could be placed; expected "
             "sharp photos of a static scene that overlap strongly, each taken a step aside from the last"
         )
-    return models
-
-
-def _placed_again(job: Job, models: list[pycolmap.Reconstruction], doubt: str) -> list[pycolmap.Reconstruction]:
-    """Return the best of doubtful models, those of a simpler lens, and if few are placed, of further attempts."""
-    logger.info("%s; placing the cameras again with a simpler lens", doubt)
-    again = _mapped(job, Attempt("Placing again", "models_simple", SIMPLE_MODEL))
-    if _placed(again) >= _placed(models):
-        models = again
-    if _few(job, models) and job.settings.mapper == INCREMENTAL:
-        return _with_more_matches(job, models)
-    if models is not again:
+    for seam in placement.seams:
+        logger.warning("%s; only the larger group is kept", seam)
+    best = placement.models[0]
+    turns = _quarter_turns(job)
+    if rolled := rolled_images(best, lambda name: turns[name] or 0):
         logger.warning(
-            "with a simpler lens only %d of %d photos could be placed; %s: look at the result with care, or take more "
-            "photos from other heights and distances",
-            *(_placed(again), _placed(models), doubt),
+            "%d of %d photos are rolled by more than %.0f degrees against the others: %s; if they were taken upright, "
+            "their places are wrong: look at the result with care",
+            *(len(rolled), placement.photos, ROLLED, listed(sorted(best.images[key].name for key in rolled))),
         )
-    return models
+    return placement.models
 
 
-def _with_more_matches(job: Job, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Return the best of these models and those with more matches, by the incremental and then the global mapper."""
-    logger.info("only %d photos could be placed; looking for more matches", _placed(models))
+def _placed_again(job: Job, first: Placement, doubt: str) -> Placement:
+    """Return the best of a doubtful placement, that of a simpler lens, and if few are placed, of further attempts."""
+    logger.info("%s; placing the cameras again with a simpler lens", doubt)
+    again = _placed(job, Attempt("Placing again", "models_simple", SIMPLE_MODEL))
+    simpler = again.photos == first.photos and again.error <= SAME_ERROR * first.error
+    best = again if simpler or again.is_better_than(first) else first
+    if _few(job, best) and job.settings.mapper == INCREMENTAL:
+        return _with_more_matches(job, best)
+    if best is not again:
+        logger.warning(
+            "a simpler lens places %d of %d photos with an error of %.2f pixels, not %d with %.2f; %s: look at the "
+            "result with care, or take more photos from other heights and distances",
+            *(again.photos, len(job.names), again.error, first.photos, first.error, doubt),
+        )
+    return best
+
+
+def _with_more_matches(job: Job, best: Placement) -> Placement:
+    """Return the best of this placement and those with more matches, by the incremental and then the global mapper."""
+    logger.info("only %d photos could be placed; looking for more matches", best.photos)
     database = match_more(job)
     for mapper, possible in ((INCREMENTAL, database is not None), (GLOBAL, HAS_GLOBAL)):
-        if possible and _few(job, models):
-            attempt = Attempt(f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database)
-            models = max(models, _mapped(job, attempt), key=_placed)  # the earlier ones if both place as many
-    return models
+        if possible and _few(job, best):
+            attempt = _placed(job, Attempt(f"Placing ({mapper})", f"models_{mapper}", SIMPLE_MODEL, mapper, database))
+            best = attempt if attempt.is_better_than(best) else best
+    return best
 
 
-def _mapped(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
-    """Return the models of an attempt, the one with most photos first, without photos whose place is arbitrary."""
-    models = map_photos(job, attempt)
-    for model in models:
+def _placed(job: Job, attempt: Attempt) -> Placement:
+    """Return what an attempt places, cut where groups of photos are glued together."""
+    models, seams, turns = map_photos(job, attempt), [], _quarter_turns(job)
+    held_upright = None not in turns.values()
+    for model in models:  # and the parts that are cut off
         remove_unlinked(model)
-    return sorted(models, key=lambda each: (each.num_reg_images(), each.num_points3D()), reverse=True)
+        while (seam := find_seam(model, lambda name: turns[name] or 0, held_upright)) is not None:
+            part = pycolmap.Reconstruction(model)
+            models.append(part)
+            for kept, gone in ((part, set(placed_images(model)) - set(seam.apart)), (model, seam.apart)):
+                for key in gone:
+                    kept.deregister_frame(kept.images[key].frame_id)
+            seams.append(_seam_words(part, model, seam))
+            remove_unlinked(model)
+    models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+    return Placement(models, tuple(seams))
 
 
-def remove_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Leave only the largest group of photos that are linked by shared points.
-
-    COLMAP's global mapper places photos by their rotations even if no points confirm it, and its incremental mapper
-    places some by a few wrong points.
-    """
-    placed = sorted(key for key, image in model.images.items() if image.has_pose)
-    seen = [
-        (row, np.searchsorted(placed, each.image_id))
-        for row, point in enumerate(model.points3D.values())
-        for each in point.track.elements
-    ]
-    rows, columns = np.array(seen, dtype=np.int64).reshape(-1, 2).T  # (n), (n)
-    sees = coo_array((np.ones(len(rows), np.int64), (rows, columns)), (model.num_points3D(), len(placed))).tocsr()
-    shared = (sees.T @ sees).tocoo()  # (photos, photos)
-    links = coo_array(((shared.data >= LINKED), (shared.row, shared.col)), shared.shape).tocsr()
-    links.eliminate_zeros()
-    _, groups = connected_components(links, directed=False)
-    largest = np.bincount(groups, minlength=1).argmax()
-    for key, group in zip(placed, groups, strict=True):
-        if group != largest:
-            model.deregister_frame(model.images[key].frame_id)
+def _seam_words(part: pycolmap.Reconstruction, rest: pycolmap.Reconstruction, seam: Seam) -> str:
+    """Return a sentence about the groups at a seam."""
+    names = listed(sorted(part.images[key].name for key in seam.apart))
+    common, others = counted(seam.points, "point"), f"{rest.num_reg_images()} others"
+    if seam.angle is None:
+        return f"{len(seam.apart)} photos ({names}) share only {common} with {others}"
+    return f"{len(seam.apart)} photos ({names}) are turned by {seam.angle:.0f} degrees against {others}, on {common}"
 
 
-def _few(job: Job, models: Sequence[pycolmap.Reconstruction]) -> bool:
+def _quarter_turns(job: Job) -> dict[str, int | None]:
+    """Return the quarter turns that make each photo upright by EXIF."""
+    return {name: quarter_turns(job.photo(name)) for name in job.names}
+
+
+def _few(job: Job, placement: Placement) -> bool:
     """Return whether so few photos are placed that another attempt may place more."""
-    return _placed(models) < FEW * len(job.names)
+    return placement.photos < FEW * len(job.names)
 
 
-def _placed(models: Sequence[pycolmap.Reconstruction]) -> int:
-    """Return the number of photos in the largest model."""
-    return models[0].num_reg_images() if models else 0
-
-
-def _doubt(job: Job, models: Sequence[pycolmap.Reconstruction]) -> str | None:
+def _doubt(job: Job, placement: Placement) -> str | None:
     """Return why the models may be wrong because the lens was not found; None if nothing says so."""
-    if _few(job, models):
-        return f"only {_placed(models)} of {len(job.names)} photos could be placed"
-    if (apart := _focal_difference(models[0])) > SQUARE:
+    if placement.seams:
+        return placement.seams[0]
+    if _few(job, placement):
+        return f"only {placement.photos} of {len(job.names)} photos could be placed"
+    if (apart := _focal_difference(placement.models[0])) > SQUARE:
         return f"the focal lengths along x and y differ by {apart:.0%}, which no usual lens does"
+    if placement.error > INEXACT:
+        return f"the points miss their features by {placement.error:.1f} pixels"
     return None
 
 

@@ -38,7 +38,7 @@ class PrepareSettings:
     camera_model: str = option(
         AUTO,
         "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
-        "OPENCV, and SIMPLE_RADIAL if that places few photos or gives implausible focal lengths.",
+        "OPENCV, and SIMPLE_RADIAL if the result is doubtful.",
     )
     matcher: str = option(
         AUTO,

@@ -27,7 +27,7 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     shutil.rmtree(job.scene, ignore_errors=True)
     model.tear_down()  # of cameras without photos
     images = [image for image in model.images.values() if image.has_pose]
-    ((turns, count),) = Counter(quarter_turns(job.photo(image.name)) for image in images).most_common(1)
+    ((turns, count),) = Counter(quarter_turns(job.photo(image.name)) or 0 for image in images).most_common(1)
     if turns:
         logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}

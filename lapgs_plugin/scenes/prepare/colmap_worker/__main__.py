@@ -8,6 +8,7 @@ drops the locks of the other. The worker is started by its path, so that it does
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import threading
@@ -19,17 +20,19 @@ import pycolmap
 
 SEED = 0
 
-MOST_DESCRIPTORS, DESCRIPTORS_A_WORD = 500_000, 50
-FEWEST_WORDS, MOST_WORDS = 64, 8192
-EMBEDDING = 64
-"""Features that a vocabulary is made of, and its size; the embedding is the only one that COLMAP has for SIFT."""
+MOST_DESCRIPTORS, DESCRIPTORS_A_WORD = 65_536, 50
+FEWEST_WORDS, MOST_WORDS = 64, 1024
+EMBEDDING, ROUNDS = 64, 6
+"""Features that a vocabulary is made of, its size, and the rounds of clustering, which take seconds and show nothing;
+the embedding is the only one that COLMAP has for SIFT."""
 
-PAIR_BLOCK = 10
-"""Photos whose features are in memory at a time in exhaustive matching."""
+PAIRS_A_THREAD = 4
+"""Pairs that a thread matches between two moves of the progress bar: COLMAP saves the pairs of a block together."""
 
 
 def main() -> None:
     """Run the step in the first line of the input. Exit when the input closes, because then the parent has died."""
+    pycolmap.logging.logtostderr = True  # and not to files in /tmp as well
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     {"features": _find_features, "pairs": _match_pairs, "map": _map}[job["step"]](job)
@@ -72,7 +75,8 @@ def _match_pairs(job: dict[str, Any]) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     if job["matcher"] == "exhaustive":
-        blocks = pycolmap.ExhaustivePairingOptions(block_size=PAIR_BLOCK)
+        side = math.ceil(math.sqrt(PAIRS_A_THREAD * (os.cpu_count() or 1)))
+        blocks = pycolmap.ExhaustivePairingOptions(block_size=max(2, side))
         pycolmap.match_exhaustive(job["database"], matching, blocks, verification)
     elif job["matcher"] == "retrieval":
         _make_tree(job["database"], job["tree"])
@@ -99,7 +103,7 @@ def _make_tree(database: str, tree: str) -> None:
     words = int(np.clip(len(descriptors) // DESCRIPTORS_A_WORD, FEWEST_WORDS, MOST_WORDS))
     index = pycolmap.VisualIndex.create(descriptors.shape[1], EMBEDDING)
     index.build(
-        pycolmap.VisualIndex.BuildOptions(num_visual_words=words, num_iterations=11, num_rounds=1),
+        pycolmap.VisualIndex.BuildOptions(num_visual_words=words, num_iterations=ROUNDS, num_rounds=1),
         pycolmap.FeatureDescriptorsFloat(used[0].type, descriptors),
     )
     index.write(tree)
@@ -108,8 +112,8 @@ def _make_tree(database: str, tree: str) -> None:
 def _map(job: dict[str, Any]) -> None:
     """Recover models.
 
-    Keys: database, photos, models (an empty folder), placed (a file that grows a byte per photo), mapper ("incremental"
-    or "global"), camera_model (to fit instead of the database's; may be missing).
+    Keys: database, photos, models (an empty folder), placed (a file that gets a line per model, a byte per photo),
+    mapper ("incremental" or "global"), camera_model (to fit instead of the database's; may be missing).
     """
     if "camera_model" in job:
         _replace_cameras(job["database"], job["camera_model"])
@@ -128,13 +132,13 @@ def _map(job: dict[str, Any]) -> None:
         options.num_threads = 1
     with Path(job["placed"]).open("wb", buffering=0) as placed:
 
-        def place(count: int) -> None:
-            placed.write(b"." * count)
+        def place(photos: bytes) -> None:
+            placed.write(photos)
 
         pycolmap.incremental_mapping(
             *(job["database"], job["photos"], job["models"], options),
-            initial_image_pair_callback=lambda: place(2),
-            next_image_callback=lambda: place(1),
+            initial_image_pair_callback=lambda: place(b"\n.."),
+            next_image_callback=lambda: place(b"."),
         )
 
 
