@@ -68,11 +68,12 @@ class LoggingProgress(Progress):
         super().advance(task_id, advance)
         self._print_if_due(task_id)
 
-    def stop(self) -> None:
-        """Stop as rich does, and print a line about work that ends with items left."""
-        super().stop()
+    def __exit__(self, kind: type[BaseException] | None, *others: Any) -> None:
+        """End as rich does, and print a line about work that ends with items left, unless it failed."""
+        super().__exit__(kind, *others)
         for task_id, (_, done) in self._printed.items():
-            if self.disable and self._tasks[task_id].total and done < self._tasks[task_id].completed:
+            task = self._tasks[task_id]
+            if self.disable and kind is None and task.total and done < task.completed:
                 self._print(task_id)
 
     def _print_if_due(self, task_id: TaskID) -> None:

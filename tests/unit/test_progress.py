@@ -6,6 +6,7 @@ import io
 import re
 import sys
 import time
+from contextlib import suppress
 
 import pytest
 from rich.console import Console
@@ -102,6 +103,10 @@ def test_work_that_ends_with_items_left_says_how_many(monkeypatch: pytest.Monkey
     with progress.item_progress("photos") as bar:
         bar.update(bar.add_task("Placing", total=40), completed=16)
     assert shown.getvalue().startswith("Placing 16 of 40 photos (40 %)")
+    with suppress(KeyboardInterrupt), progress.item_progress("photos") as bar:
+        bar.update(bar.add_task("Reading", total=40), completed=16)
+        raise KeyboardInterrupt
+    assert "Reading" not in shown.getvalue(), "the reason is enough"
 
 
 def test_time_left_does_not_jump_with_items_that_come_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
