@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ import pytest
 gc.set_threshold(10_000, 20, 20)
 
 SHARED_DATA = Path(os.environ.get("LAPGS_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+MODULES_OF_EXTRAS = ("cv2", "imageio_ffmpeg", "mkdocs", "pillow_heif", "playwright", "pyarrow", "safetensors", "viser")
 
 
 @pytest.fixture
@@ -27,6 +29,22 @@ def shared_data() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start with tests of pages: a browser that draws in software takes longest beside other processes."""
     items.sort(key=lambda item: item.get_closest_marker("browser") is None)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Skip files by name that need a package of the extras, when only GPU tests are asked for.
+
+    GPU machines often have PyTorch and little else. Everywhere else a missing package is an error.
+    """
+    report = yield
+    if report.failed and "gpu" in collector.config.option.markexpr:
+        missing = re.search(rf"No module named '({'|'.join(MODULES_OF_EXTRAS)})", str(report.longrepr))
+        if missing:
+            report.outcome, report.longrepr = "skipped", (str(collector.path), 1, f"Skipped: needs {missing[1]}")
+    return report
 
 
 def pytest_unconfigure() -> None:

@@ -7,8 +7,8 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
+from PIL import Image
 
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.runs.archive import RunArchive
@@ -43,7 +43,7 @@ def write_scene(folder: Path, view_names: list[str] | None = None, size: tuple[i
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
         stripes = [0.5 + 0.4 * np.sin(0.3 * (c + 1) * x + 0.2 * y + i) for c in range(3)]
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / name), np.rint(np.stack(stripes, axis=2) * 255).astype(np.uint8))
+        Image.fromarray(np.rint(np.stack(stripes[::-1], axis=2) * 255).astype(np.uint8)).save(folder / name)
     values = {"w": width, "h": height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     (folder / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
     return folder

@@ -370,11 +370,12 @@ def test_no_result_is_written_through_a_link(run: Path, precious: Path, command:
 
 
 @pytest.mark.parametrize(
-    ("command", "name"), [("eval", METRICS), ("eval", f".{METRICS}.{os.getpid()}.tmp"), ("report", "report.html")]
+    ("command", "name"), [("eval", METRICS), ("eval", f".{METRICS}.PROCESS.tmp"), ("report", "report.html")]
 )
 def test_a_result_takes_the_place_of_a_link(run: Path, precious: Path, command: str, name: str) -> None:
     write_metrics(run)
     before = snapshot(precious)
+    name = name.replace("PROCESS", str(os.getpid()))
     replaced_by_a_link(run / name, precious / "file")
     lapgs(command, run, "--device", "cpu", *(("--lpips", "none") if command == "eval" else ()))
     assert snapshot(precious) == before
