@@ -25,12 +25,6 @@ def trajectory(path: str) -> None:
     read_trajectory(Path(path))
 
 
-def phone_photo(path: str) -> None:
-    from lapgs_plugin.scenes.prepare.photos import convert_photo
-
-    convert_photo(Path(path), Path("out.jpg"))
-
-
 def recipes(folder: str) -> None:
     from lapgs_plugin.patching.recipe import load_recipes
 
@@ -71,7 +65,6 @@ READERS: dict[str, Callable[..., Any]] = {
     "read-scene": scene,
     "read-field": field,
     "read-trajectory": trajectory,
-    "convert-photo": phone_photo,
     "read-recipes": recipes,
     "misbehave": misbehave,
 }

@@ -9,6 +9,8 @@ foreign/       what a 3DGS codebase leaves; foreign_levels/ what the release doe
 bench/         an experiment's folder, experiment.toml beside its store
 recipes/       of `lapgs patch`
 path/          a trajectory
+config/        run.toml, the settings of a run
+video/         a clip
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pillow_heif
 import pycolmap
@@ -48,7 +51,7 @@ from tests.training_scene import blob_field, ring_camera
 SIZE = (40, 32)
 VIEWS = 3
 POINTS = 12
-PHOTOS = ("png", "jpg", "gif", "exr", "tif")
+PHOTOS = ("png", "jpg", "gif", "exr", "tif", "webp", "heic")
 
 
 def make_templates(folder: Path, reader: Reader) -> Path:
@@ -66,12 +69,10 @@ def make_templates(folder: Path, reader: Reader) -> Path:
     _write_runs(folder, reader)
     _write_ascii_field(folder)
     _write_foreign(folder)
+    _write_config(folder)
+    _write_clip(folder / "video")
     _write_experiment(folder, reader)
     shutil.copytree(shipped("patches"), folder / "recipes")
-    pillow_heif.register_heif_opener()
-    for suffix in ("heic", "webp"):
-        (folder / "phone").mkdir(exist_ok=True)
-        write_photo(folder / "phone" / f"0.{suffix}", 0)
     (folder / "path").mkdir()
     (folder / "path" / "trajectory.json").write_text(as_json({**_intrinsics(), "frames": _frames(["a", "b"])}))
     return folder
@@ -125,6 +126,10 @@ def write_photo(path: Path, index: int) -> None:
         cv2.imwrite(str(path), _stripes(index).astype(np.uint16) * 257)
     elif path.suffix == ".png" and index == 2:
         picture.convert("P").save(path)
+    elif path.suffix == ".heic":
+        pillow_heif.from_pillow(picture).save(path)
+    elif path.suffix == ".webp":
+        picture.save(path, lossless=index == 1)
     elif path.suffix in (".tif", ".jpg") and index == 1:
         picture.convert("L").save(path)
     elif path.suffix == ".tif" and index == 2:
@@ -193,6 +198,21 @@ def _write_runs(folder: Path, reader: Reader) -> None:
     ]
     (done / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     _succeed(reader, folder, "eval", str(done), "--lpips", "none", "--rasterizer", "oracle")
+
+
+def _write_config(folder: Path) -> None:
+    """The settings of a run, as `lapgs train` writes them, with the scene where it is."""
+    (folder / "config").mkdir()
+    shutil.copy(folder / "run_part" / "run.toml", folder / "config" / "run.toml")
+
+
+def _write_clip(folder: Path) -> None:
+    folder.mkdir()
+    writer = imageio_ffmpeg.write_frames(str(folder / "clip.mp4"), SIZE, fps=10, quality=10, macro_block_size=1)
+    writer.send(None)
+    for index in range(12):
+        writer.send(np.roll(_stripes(index), 3 * index, axis=1).tobytes())
+    writer.close()
 
 
 def _write_ascii_field(folder: Path) -> None:

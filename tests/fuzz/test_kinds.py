@@ -90,7 +90,7 @@ def misbehaving(how: str) -> Case:
     ],
 )
 def test_a_message_is_a_line_of_text(message: str, what: str) -> None:
-    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": ""}
+    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": "", "shown": ""}
     problem = judged(answer, misbehaving("nothing"), Path("case"), Path("templates"))
     assert problem is not None
     assert problem.what == what
