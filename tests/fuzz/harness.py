@@ -326,10 +326,9 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]], outside: Path) -> Pa
     """
     for action, name, *other in steps:
         path = folder / name
-        special = action in SPECIAL and path.parent.is_dir()
-        if not (path.exists() or special) or (
-            action != "rename" and os.path.normpath(path) == os.path.normpath(folder)
-        ):
+        itself = os.path.normpath(path) == os.path.normpath(folder)
+        there = path.exists() or (action in SPECIAL and path.parent.is_dir())
+        if not there or (itself and action != "rename") or _through_link(path, folder):
             continue
         if action == "rename" and not name:
             folder = folder.rename(folder.with_name(other[0]))
@@ -337,18 +336,23 @@ def rearrange(folder: Path, steps: Sequence[Sequence[str]], outside: Path) -> Pa
             _rename(folder, path, other[0])
         elif action == "copy":
             target = folder / other[0]
-            if path.is_file() and target.is_file():
+            if path.is_file() and target.is_file() and not _through_link(target, folder):
                 target.write_bytes(path.read_bytes())
         elif action == "move":
             if not path.with_name(Path(other[0]).name).is_dir():
                 path.rename(path.with_name(Path(other[0]).name))
         else:
-            if path.is_dir() and not path.is_symlink():
+            if path.is_dir():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
             _put(action, path, outside / name)
     return folder
+
+
+def _through_link(path: Path, folder: Path) -> bool:
+    """Whether a path in the folder is a link or lies behind one, as a former step made it."""
+    return os.path.realpath(path) != os.path.normpath(os.path.realpath(folder) + os.sep + os.path.relpath(path, folder))
 
 
 SPECIAL = {

@@ -23,7 +23,7 @@ from tests.fuzz.kinds import BY_NAME, KINDS
 from tests.fuzz.mutations import as_json, as_namespace, as_toml, damaged_tree
 from tests.fuzz.worker import STOPPED
 
-CASES = 12
+CASES = 8
 """Of each kind in `make test`."""
 MANY_CASES = 6_000
 
