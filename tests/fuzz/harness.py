@@ -175,10 +175,10 @@ class Reader:
         for process in family:
             try:
                 words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+                ticks += sum(map(int, words[11:15]))  # with those of its children that have ended
                 family += Path(f"/proc/{process}/task/{process}/children").read_text().split()
             except OSError:
                 continue
-            ticks += sum(map(int, words[11:15]))  # with those that have ended
         return ticks / os.sysconf("SC_CLK_TCK")
 
     @property

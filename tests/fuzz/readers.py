@@ -44,6 +44,8 @@ def misbehave(how: str) -> None:
         raise UserInputError("it is damaged")
     if how == "raise":
         raise KeyError("scale_0")
+    if how == "follow":
+        Path("ascii/field.ply").write_text("through a link")
     if how == "abort":
         os.abort()
     if how == "exit":

@@ -103,6 +103,21 @@ def test_every_broken_rule_is_told(fuzzer: Fuzzer, how: str) -> None:
     assert problem.what.startswith(HOW[how])
 
 
+def test_a_file_outside_that_a_command_writes_through_a_link_is_told(fuzzer: Fuzzer) -> None:
+    kind = Kind("links", "ascii", lambda data, random: data, [("misbehave", "follow")], layout=True)
+    problem = fuzzer.problem(Case(kind, b'[["outside", "field.ply"]]', kind.commands[0]))
+    assert problem is not None
+    assert problem.what == "wrote through a link"
+    assert fuzzer.problem(Case(kind, b"[]", kind.commands[0])) is None
+
+
+def test_control_characters_in_what_a_command_prints_are_told() -> None:
+    answer = {"message": "", "trace": "", "highest": 0, "starved": False, "code": 0, "printed": ""}
+    for shown, what in (("made out\n", None), ("made \x1b[2J\n", "control characters in its output")):
+        problem = judged({**answer, "shown": shown}, misbehaving("nothing"), Path("case"), Path("templates"))
+        assert (problem and problem.what) == what
+
+
 def test_a_process_that_ends_hangs_or_grows_is_told_and_started_again(
     fuzzer: Fuzzer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
