@@ -190,6 +190,7 @@ KINDS = (
     Kind("breakdown", "foreign_levels/runtime_breakdown.json", JSON, [("import-run", "foreign_levels", "-o", "out")]),
     Kind("tables", "bench/tables.md", _text, [("report", "bench", *ORACLE)]),
     Kind("config", "config/run.toml", TOML, [CONFIG]),
+    Kind("config as text", "config/run.toml", _text, [CONFIG]),
     Kind("config of others", "config/run.toml", variants.config, [CONFIG]),
     Kind("video", "video/clip.mp4", damaged_clip, [("prepare", "video/clip.mp4", "out")]),
     *(
