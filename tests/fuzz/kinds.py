@@ -105,7 +105,7 @@ RESUME = ("train", "{templates}/scene_json", "-o", "run_part", "--resume")
 REPORT = ("report", "run_done", *ORACLE)
 EXPORT = ("export", "run_done", "-o", "out")
 CLIP = ("render", "run_done", *ORACLE, "--trajectory", "path/trajectory.json", "-o", "clip")
-CONFIG = ("train", "--config", "config/run.toml", "-o", "run_new")
+CONFIG = ("train", "{templates}/scene_json", "--config", "config/run.toml", "-o", "run_new")
 TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
 
 
