@@ -105,7 +105,7 @@ RESUME = ("train", "{templates}/scene_json", "-o", "run_part", "--resume")
 REPORT = ("report", "run_done", *ORACLE)
 EXPORT = ("export", "run_done", "-o", "out")
 CLIP = ("render", "run_done", *ORACLE, "--trajectory", "path/trajectory.json", "-o", "clip")
-CONFIG = ("train", "{templates}/scene_json", "--config", "config/run.toml", "-o", "run_new")
+CONFIG = ("train", "{templates}/scene_json", "--config", "run_done/run.toml", *ORACLE, "-o", "run_new")
 TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
 
 
@@ -189,9 +189,7 @@ KINDS = (
     Kind("TRAIN_INFO", "foreign_levels/L1/TRAIN_INFO", _text, [("import-run", "foreign_levels", "-o", "out")]),
     Kind("breakdown", "foreign_levels/runtime_breakdown.json", JSON, [("import-run", "foreign_levels", "-o", "out")]),
     Kind("tables", "bench/tables.md", _text, [("report", "bench", *ORACLE)]),
-    Kind("config", "config/run.toml", TOML, [CONFIG]),
-    Kind("config as text", "config/run.toml", _text, [CONFIG]),
-    Kind("config of others", "config/run.toml", variants.config, [CONFIG]),
+    Kind("settings of others", "run_done/run.toml", variants.config, [CONFIG]),
     Kind("video", "video/clip.mp4", damaged_clip, [("prepare", "video/clip.mp4", "out")]),
     *(
         Kind(

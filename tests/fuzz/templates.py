@@ -9,7 +9,6 @@ foreign/       what a 3DGS codebase leaves; foreign_levels/ what the release doe
 bench/         an experiment's folder, experiment.toml beside its store
 recipes/       of `lapgs patch`
 path/          a trajectory
-config/        run.toml, the settings of a run
 video/         a clip
 """
 
@@ -69,7 +68,6 @@ def make_templates(folder: Path, reader: Reader) -> Path:
     _write_runs(folder, reader)
     _write_ascii_field(folder)
     _write_foreign(folder)
-    _write_config(folder)
     _write_clip(folder / "video")
     _write_experiment(folder, reader)
     shutil.copytree(shipped("patches"), folder / "recipes")
@@ -198,12 +196,6 @@ def _write_runs(folder: Path, reader: Reader) -> None:
     ]
     (done / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     _succeed(reader, folder, "eval", str(done), "--lpips", "none", "--rasterizer", "oracle")
-
-
-def _write_config(folder: Path) -> None:
-    """The settings of a run, as `lapgs train` writes them, with the scene where it is."""
-    (folder / "config").mkdir()
-    shutil.copy(folder / "run_part" / "run.toml", folder / "config" / "run.toml")
 
 
 def _write_clip(folder: Path) -> None:
