@@ -153,6 +153,7 @@ def _write_colmap(folder: Path, binary: bool) -> None:
     (model / "images.txt").write_text("\n".join(poses) + "\n")
     (model / "points3D.txt").write_text(
         "1 0.1 0.2 0.3 200 100 50 0.5 1 0 2 0 3 0\n2 -0.3 0.1 0.2 10 20 30 0.5 2 1 3 1\n"
+        + "".join(f"{number} 0.{number} -0.1 0.{number} 90 80 70 0.5\n" for number in range(3, 7))  # without tracks
     )
     (model / "rigs.txt").write_text("1 1 CAMERA 1\n")
     frames = [f"{index} 1 {' '.join(pose.split()[1:8])} 1 CAMERA 1 {index}" for index, pose in enumerate(poses[::2], 1)]
