@@ -12,6 +12,8 @@ TICKS, INSET_TICKS = 5, 3
 HEADROOM = 1.04
 INSET_POINTS = 3
 """Least number of points at the start of a line for an inset."""
+FEW_POINTS = 20
+"""Most points of a line whose points are marked: between few points a line is no measurement."""
 LEAST_SPAN = 0.02
 """Least span of an axis as a share of its largest value, so that labels of a flat line stay short."""
 BAR_STEP = 30.0
@@ -84,6 +86,11 @@ class Series:
 
     kind: str
     points: Sequence[tuple[float, float]]
+
+    @property
+    def dots(self) -> Sequence[tuple[float, float]]:
+        """The points to mark: all when they are few, else the last."""
+        return self.points if len(self.points) <= FEW_POINTS else self.points[-1:]
 
 
 @dataclass(frozen=True)

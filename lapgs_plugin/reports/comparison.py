@@ -73,7 +73,12 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     )
     rows = []
     for key, label, pattern, compare in table:
-        cells = tuple(_cell(each.get(key), pattern, 1e-9 if key.endswith("_bytes") else 1.0) for each in metrics)
+        scale = 1e-9 if key.endswith("_bytes") else 1.0
+        cells = tuple(
+            # A loop of the user's own that has measured no time has recorded 0 seconds.
+            _cell(each.get(key) or None if key == "train_seconds" else each.get(key), pattern, scale)
+            for each in metrics
+        )
         values = [cell.value for cell in cells if cell.value is not None]
         if not values and key in OPTIONAL_ROWS:
             continue

@@ -84,6 +84,12 @@ class Strip:
         return count if count <= MOST_COLUMNS else (count + 1) // 2
 
     @property
+    def narrow_columns(self) -> int:
+        """Cut-outs in a row of a narrow page: two to four, so that none is alone in the last row."""
+        count = len(self.pictures)
+        return next((columns for columns in (3, 2, 4) if count % columns != 1), 3)
+
+    @property
     def compared(self) -> tuple[int, int]:
         """Indices of the pictures that are compared first: the baseline, or else the photo, and the composition."""
         captions = [picture.caption for picture in self.pictures]

@@ -1,5 +1,17 @@
-// Show two pictures of a view on top of each other, with a divider to drag or to move with the arrow keys.
+// Say where a table has columns beside the window: a phone shows no bar to scroll by.
 "use strict";
+for (const box of document.querySelectorAll(".scroll")) {
+  const update = () => {
+    const before = box.scrollLeft, hidden = box.scrollWidth - box.clientWidth - before;
+    box.style.setProperty("--hidden", hidden > 1 ? `${hidden}px` : "-2.5rem");  // moves the fading off the table
+    if (before + hidden > 1) box.dataset.sign = `${before > 1 ? "\u2190 " : ""}more columns${hidden > 1 ? " \u2192" : ""}`;
+    else delete box.dataset.sign;
+  };
+  box.addEventListener("scroll", update, { passive: true });
+  new ResizeObserver(update).observe(box);
+}
+
+// Show two pictures of a view on top of each other, with a divider to drag or to move with the arrow keys.
 for (const strip of document.querySelectorAll(".strip")) {
   const pictures = [...strip.querySelectorAll(".zoom img")];
   const compare = strip.querySelector(".compare");

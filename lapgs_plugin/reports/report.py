@@ -36,6 +36,7 @@ from lapgs_plugin.reports.comparison import Metrics, comparison_rows, setup_diff
 from lapgs_plugin.reports.pictures import Strip, make_strip
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
+from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
 from lapgs_plugin.runs.training_figures import weak_levels
 from lapgs_plugin.untrusted import shortened
@@ -110,6 +111,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         strips=view_strips(run, renderers, options.scene),
         views=view_table(runs),
         settings=_settings(run),
+        advised=_takes_advice(run.archive.manifest),
     )
     path = run.archive.path(REPORT)
     write_text(path, page)
@@ -136,7 +138,7 @@ History = list[dict[str, Any]]
 def training_charts(
     runs: Sequence[MeasuredRun], kinds: Sequence[str], *, marked: bool = False
 ) -> dict[str, list[Chart]]:
-    """Draw loss, held-out PSNR and number of Gaussians over time and over iterations, as far as they were recorded.
+    """Draw loss, held-out PSNR and number of Gaussians over iterations, and over time if it was measured.
 
     Args:
         runs: the runs to draw, the first on top.
@@ -153,6 +155,7 @@ def training_charts(
             ("time", f"{unit} of optimization", START_SHARE * longest / scale),
             ("iterations", "iterations, all stages", None),
         )
+        if any(entry[x] for history in histories for entry in history)
     }
 
 
@@ -203,8 +206,10 @@ def _stage_marks(history: History, x: str) -> list[Mark]:
 # Time and number of Gaussians.
 
 
-def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart:
-    """Draw time against Gaussians, as an arrow from the baseline to the run."""
+def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart | None:
+    """Draw time against Gaussians, as an arrow from the baseline to the run, if both have measured their time."""
+    if not (run.metrics["train_seconds"] and baseline.metrics["train_seconds"]):
+        return None
     ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
     label = "Gaussians of levels, weighted by iterations"
     return draw_arrows("Optimization (s) against Gaussians", label, [Arrow(RUN, "", *ends)])
@@ -287,6 +292,12 @@ def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
                 cells += [(theirs, f"{theirs:.2f}"), (view["psnr"] - theirs, f"{view['psnr'] - theirs:+.2f}")]
         rows[view["name"]] = cells
     return ViewTable([*keys.values(), *(["baseline PSNR", "gain"] if others else [])], rows)
+
+
+def _takes_advice(manifest: Manifest) -> bool:
+    """Return whether options of `lapgs train` and `lapgs run` can be advised: not to a loop of the user's own."""
+    settings = manifest.settings
+    return "iterations" in settings and "imported_from" not in settings.get("backbone", {})
 
 
 def _settings(run: MeasuredRun) -> dict[str, str]:

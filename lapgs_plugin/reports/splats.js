@@ -199,10 +199,10 @@ class Viewer {
     gl.clearColor(...this.start.background, 1);
   }
 
-  /** Focal length in pixels at which the whole first view fits into the window. */
+  /** Focal length in pixels at which the first photo fills the window: what is beside it was never photographed. */
   get focal() {
     const [x, y] = this.start.focal;
-    return Math.min(x * this.canvas.width, y * this.canvas.height);
+    return Math.max(x * this.canvas.width, y * this.canvas.height);
   }
 
   later() {
@@ -255,6 +255,10 @@ class Viewer {
       this.later();
     }, { passive: false });
     addEventListener("keydown", (event) => this.key(event));
+    again.addEventListener("click", () => {
+      this.camera.reset();
+      this.later();
+    });
   }
 
   drag(before, now, other) {
@@ -278,17 +282,24 @@ class Viewer {
     if (turns[event.key]) this.camera.turn(...turns[event.key]);
     else if (zooms[event.key]) this.camera.zoom(zooms[event.key]);
     else if (event.key.toLowerCase() === "r") this.camera.reset();
-    else if (event.key.toLowerCase() === "h") words.hidden = !words.hidden;
+    else if (event.key.toLowerCase() === "h") words.hidden = again.hidden = !words.hidden;
     else return;
     event.preventDefault();
     this.later();
   }
 }
 
-const words = document.getElementById("words");
-try {
-  const [bytes, count] = decode(document.getElementById("splats").textContent);
-  new Viewer(document.querySelector("canvas"), bytes, count, START);
-} catch (error) {
-  words.textContent = `The scene cannot be shown: ${error.message}`;
-}
+const words = document.getElementById("words"), again = document.querySelector("button");
+clearInterval(loading);
+state.textContent = "Preparing the scene";
+// A task after the next frame: preparing takes seconds on a phone, which should show that it does.
+requestAnimationFrame(() => setTimeout(() => {
+  try {
+    const [bytes, count] = decode(document.getElementById("splats").textContent);
+    new Viewer(document.querySelector("canvas"), bytes, count, START);
+    state.hidden = true;
+    words.hidden = again.hidden = false;
+  } catch (error) {
+    state.textContent = `The scene cannot be shown: ${error.message}`;
+  }
+}));

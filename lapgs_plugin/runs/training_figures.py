@@ -27,14 +27,14 @@ def weak_levels(records: Sequence[LevelRecord], psnr: Mapping[int, float], views
     """
     lines = [
         f"level {record.level} ended with {record.num_gaussians:,} of the {record.start_gaussians:,} Gaussians that it "
-        "started with: hardly any of its detail is in the image; compare with a run of other --levels or --hierarchy"
+        "started with: hardly any of its detail is in the image; compare with fewer levels or the other hierarchy"
         for record in records
         if record.start_gaussians is not None and record.num_gaussians < FEW_LEFT * record.start_gaussians
     ]
     if psnr.keys() >= {0, 1} and (gain := psnr[0] - psnr[1]) < SMALL_GAIN:
         lines.append(
             f"level 0 changes the PSNR of {views} images by {gain:+.2f} dB, from {psnr[1]:.2f} to {psnr[0]:.2f}: they "
-            "are little more than the coarser level's, enlarged; compare with a run of other --levels or --hierarchy"
+            "are little more than the coarser level's, enlarged; compare with fewer levels or the other hierarchy"
         )
     return lines
 

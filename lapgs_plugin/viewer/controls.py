@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import viser
@@ -12,6 +13,11 @@ from lapgs_plugin.viewer.pictures import Picture, PictureSettings, ShownRun
 MAX_GAIN, GAIN_STEP = 3.0, 0.05
 COMPOSITION = "composition"
 BY_SIZE = "by distance and window"
+
+SHEET_WIDTH, FLAT = 576, 2.1
+"""Width below which viser shows its panel as a sheet over the picture; width over height of a phone on its side."""
+MARGIN = 15
+"""CSS pixels between the controls of a narrow window and its border."""
 
 
 class Controls:
@@ -47,29 +53,30 @@ class Controls:
         self._gui = client.gui
         self._run = run
         self._changed = changed
-        self._folders: list[Any] = []
+        self._parts: list[Any] = []
         if before is not None:
             before.close()
-        with self._folder("Bands"):
-            self._bands = {level: self._add_band(level) for level in run.counts}
-        with self._folder("Picture"):
-            self._show = self._add_choice("Show", [COMPOSITION, *map(self._band_name, run.counts)])
-            self._level = self._add_choice("Detail", [*(f"level {level}" for level in sorted(run.counts)), BY_SIZE])
-            self._split, self._divider = self._add_split(other)
-        if views:
-            with self._folder("Cameras"):
-                self._add_cameras(views, go_to, show_cameras)
-        with self._folder("Path"):
-            self._add_path(keep, save)
-        with self._folder("Figures"):
-            self._figures = self._gui.add_markdown("")
+        with self._room(client.camera):
+            with self._folder("Bands"):
+                self._bands = {level: self._add_band(level) for level in run.counts}
+            with self._folder("Picture"):
+                self._show = self._add_choice("Show", [COMPOSITION, *map(self._band_name, run.counts)])
+                self._level = self._add_choice("Detail", [*(f"level {level}" for level in sorted(run.counts)), BY_SIZE])
+                self._split, self._divider = self._add_split(other)
+            if views:
+                with self._folder("Cameras"):
+                    self._add_cameras(views, go_to, show_cameras)
+            with self._folder("Path"):
+                self._add_path(keep, save)
+            with self._folder("Figures"):
+                self._figures = self._gui.add_markdown("")
         if before is not None:
             self._copy_choices(before)
 
     def close(self) -> None:
         """Remove the panel from the page."""
-        for folder in self._folders:
-            folder.remove()
+        for part in reversed(self._parts):
+            part.remove()
 
     def fits(self, run: ShownRun, other: ShownRun | None) -> bool:
         """Tell whether the panel fits these runs; if so, it shows them from now on."""
@@ -109,9 +116,22 @@ class Controls:
         )
         self._figures.content = "\n".join([*rows, "", line])
 
+    def _room(self, camera: viser.CameraHandle) -> AbstractContextManager[Any]:
+        """Return where to add controls: the main panel, or a closed one in a narrow window, which that would cover."""
+        width, height = camera.image_width, camera.image_height  # device pixels, up to three a CSS pixel on phones
+        if max(height, SHEET_WIDTH) <= width <= FLAT * height:
+            return nullcontext()
+        panel = self._gui.add_panel()
+        panel.float(x=-MARGIN, y=-MARGIN)  # lower right: viser's own messages come at the upper left
+        panel.minimize()
+        self._gui.main_panel.minimize()
+        self._parts.append(panel)
+        tab: AbstractContextManager[Any] = panel.add_tab("Controls")
+        return tab
+
     def _folder(self, name: str) -> Any:
         folder = self._gui.add_folder(name)
-        self._folders.append(folder)
+        self._parts.append(folder)
         return folder
 
     def _copy_choices(self, before: Controls) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +29,7 @@ from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
 from tests.training_scene import HEIGHT, WIDTH, blob_field
 
 ENLARGED = 8
+PHONE = (390, 844)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +113,70 @@ def test_a_browser_shows_the_splats_as_a_rasterizer_renders_them(run: Path) -> N
         page.wait_for_timeout(100)
         assert np.array_equal(_picture(page), first)
     assert troubles == []
+
+
+@pytest.fixture(scope="module")
+def phone() -> Iterator[Any]:
+    """A phone's browser, upright, with a screen to touch."""
+    pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with headless_chromium(*SOFTWARE_3D) as browser:
+        size = {"width": PHONE[0], "height": PHONE[1]}
+        yield browser.new_context(viewport=size, has_touch=True, is_mobile=True, device_scale_factor=1)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_phone_shows_what_was_photographed_and_how_to_touch_it(run: Path, phone: Any) -> None:
+    page = phone.new_page()
+    page.goto((run / "export" / "scene.html").as_uri())
+    page.wait_for_selector("canvas[data-shown]", state="attached")
+    words = page.locator("#words")
+    assert words.inner_text().strip() == "Drag to turn, pinch to zoom, two fingers to move"
+    button = page.get_by_role("button", name="Start again")
+    box = button.bounding_box()
+    assert min(box["width"], box["height"]) >= 44  # pixels that a finger hits
+    page.keyboard.press("h")
+    first = _picture(page)
+    # The middle of the first photo fills the window: nothing is seen that lay outside of the photo.
+    whole = next(iter(run_cameras(RunArchive.open(run))[0].values()))
+    enlarged = whole.resized(round(WIDTH * PHONE[1] / HEIGHT), PHONE[1])
+    left = (enlarged.width - PHONE[0]) // 2
+    photo = _rendered(run, enlarged)[..., left : left + PHONE[0]]
+    assert psnr(_tensor(first), photo) > 38
+    page.keyboard.press("h")
+    page.touchscreen.tap(100, 400)
+    assert not words.is_visible()
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(260, 420)
+    page.mouse.up()
+    button.tap()
+    page.evaluate("again.hidden = true")
+    page.wait_for_timeout(100)
+    assert np.array_equal(_picture(page), first)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_page_that_has_not_arrived_says_how_much_has(run: Path, phone: Any, tmp_path: Path) -> None:
+    whole = (run / "export" / "scene.html").read_text()
+    begin, length = re.search(r'id="splats">', whole).end(), len(re.findall(r'id="splats">([^<]+)<', whole)[0])
+    part = tmp_path / "part.html"
+    part.write_text(whole[: begin + length // 2])
+    page = phone.new_page()
+    page.goto(part.as_uri())
+    assert page.locator("#state").inner_text().startswith("Loading the scene")
+    page.get_by_text("Loading the scene: 50 %").or_(page.get_by_text("Loading the scene: 49 %")).wait_for()
+    assert not page.get_by_role("button").is_visible()
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_browser_that_cannot_show_the_scene_says_so(run: Path, phone: Any) -> None:
+    page = phone.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto((run / "export" / "scene.html").as_uri())
+    page.get_by_text("The scene cannot be shown: this browser has no WebGL 2").wait_for()
 
 
 def _picture(page: object) -> NDArray[np.uint8]:

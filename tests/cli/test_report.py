@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,9 +17,13 @@ import typer
 
 from lapgs_plugin.cli.report import report
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
+from lapgs_plugin.scenes import load_scene
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
+from tests.training_scene import HEIGHT, WIDTH, blob_field
 
 app = typer.Typer()
 app.command()(report)
@@ -238,6 +243,39 @@ def test_a_single_field_without_held_out_views_or_history(scene: Path, tmp_path:
     assert not page.all("polyline")
     # Worst, median and best; photo and composition, each with two cut-outs, and the two that the script fills.
     assert len(page.all("img")) == 3 * (2 + 2 * 2 + 2)
+
+
+@pytest.mark.parametrize("noted", [[], [{"level": 0, "iteration": 4, "loss": 0.2}]], ids=["no history", "a history"])
+def test_a_loop_of_ones_own_is_not_given_times_or_options(
+    scene: Path, tmp_path: Path, noted: list[dict[str, float]]
+) -> None:
+    """As docs/python.md writes its run folder: no time is measured, nothing is held out, history is optional."""
+    reference = SceneReference.of(load_scene(scene, progress=False), resolution="full")
+    stages = StagePlan.create((WIDTH, HEIGHT), 8, levels=2)
+    with RunArchive.create(tmp_path / "run", Manifest.of_loop(reference, stages.levels, "cpu")) as archive:
+        for stage in stages:
+            field = blob_field(50)
+            for entry in noted:
+                archive.append_history({**entry, "level": stage.level})
+            archive.finish_level(LevelRecord.of(stage, field), replace(field, signed=stage.signed))
+    output = lapgs_report(tmp_path / "run")
+    assert re.search(r"Optimization \(s\) +not measured", output)
+    page = Page((tmp_path / "run" / "report.html").read_text())
+    assert "train_seconds" not in page.figures
+    assert "No views were held out" in page.text
+    assert not re.search(r"--\w+", page.text), "an option that the loop does not have"
+    assert "over time" not in page.text
+    assert ("over iterations" in page.text) == bool(noted)
+
+
+def test_options_are_advised_where_there_are_some(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, hold_out=False)
+    manifest = json.loads((run / "manifest.json").read_text())
+    for record in manifest["records"]:
+        record["breakdown_seconds"] = {}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    lapgs_report(run)
+    assert set(re.findall(r"--\w+", Page((run / "report.html").read_text()).text)) == {"--eval", "--breakdown"}
 
 
 def test_differences_of_setup_are_reported(run: Path, scene: Path, tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,7 +18,7 @@ from tests.cli.test_report import lapgs_report
 from tests.cli.test_report_experiment import write_experiment
 from tests.headless import CHROMIUM, NO_CHROMIUM, headless_chromium
 
-pytest.importorskip("playwright.sync_api", reason="needs playwright")
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 PHONE, DESKTOP = (390, 844), (1280, 900)
@@ -182,3 +184,30 @@ def test_a_small_picture_is_enlarged_and_put_back(page: Any) -> None:
     assert image.bounding_box()["width"] == page.viewport_size["width"]
     image.click()
     assert image.bounding_box()["width"] == before["width"]
+
+
+@pytest.mark.parametrize("baseline", [False, True], ids=["4 pictures", "5 pictures"])
+def test_no_cut_out_is_alone_in_its_row_on_a_phone(browser: Any, address: str, tmp_path: Path, baseline: bool) -> None:
+    if not baseline:
+        run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+        lapgs_report(run)
+        address = (run / "report.html").as_uri()
+    with opened(browser, address, PHONE) as page:
+        tops = page.locator(".cutout").first.locator("img").evaluate_all("nodes => nodes.map(node => node.y)")
+        assert len(tops) == 4 + baseline
+        assert min(Counter(tops).values()) > 1
+
+
+def test_a_table_with_columns_beside_the_window_says_so(browser: Any, address: str) -> None:
+    with opened(browser, address, PHONE) as page:
+        box = page.locator(".scroll", has=page.locator("#levels"))
+        for position, sign in (
+            (0, "more columns \u2192"),
+            (100, "\u2190 more columns \u2192"),
+            (9999, "\u2190 more columns"),
+        ):
+            box.evaluate("(node, position) => node.scrollTo(position, 0)", position)
+            playwright.expect(box).to_have_attribute("data-sign", sign)
+            assert box.evaluate("node => getComputedStyle(node, '::before').content") == f'"{sign}"'
+    with opened(browser, address, DESKTOP) as page:
+        assert page.locator("[data-sign]").count() == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
 import sqlite3
 import struct
 import tempfile
@@ -79,18 +80,77 @@ def damaged_jpeg(data: bytes, random: Random) -> bytes:
     return data[:at] + random.choice((b"\0\0", b"\xff\xff", b"\0\1", b"\x0c\1", b"\x7f\xff")) + data[at + 2 :]
 
 
-def damaged_phone_photo(data: bytes, random: Random) -> bytes:
-    """A side of a HEIC or WebP photo, or the pixels of one whose copy was interrupted."""
-    if random.random() < 0.4:
-        return damaged_file(data, random)
-    if random.random() < 0.3:
-        at = random.randrange(len(data))
-        return data[:at] + bytes(len(data) - at)
-    if (box := data.find(b"ispe")) >= 0:
-        at = box + 8 + random.choice((0, 4))
+def stored_jpeg(data: bytes, random: Random) -> bytes:
+    """Bytes between segments or restart markers in the pixels, as drones write them, or an end that comes too early."""
+    action, pixels = random.randrange(4), data.index(b"\xff\xda")
+    if action == 0:
+        return data[: random.randrange(pixels, len(data))]
+    if action == 1:
+        return (
+            data[:pixels] + random.choice((b"\0" * 4, b"\xff" * 3, b"APP", b"\xff\xe1\0\x08junk\0\0")) + data[pixels:]
+        )
+    if action == 2:
+        at = random.randrange(pixels + 14, len(data))
+        return data[:at] + bytes([0xFF, 0xD0 + random.randrange(8)]) + data[at:]
+    return data + random.choice((b"\0" * 1000, data, b"MPF\0" + data[:100]))
+
+
+def _interrupted(data: bytes, random: Random) -> bytes:
+    """The file as an interrupted copy leaves it: short, or with zeros at its end."""
+    at = random.randrange(len(data))
+    return data[:at] + random.choice((b"", bytes(len(data) - at)))
+
+
+def damaged_webp(data: bytes, random: Random) -> bytes:
+    """The sides in its header, up to 16 million with the extended one; a file cut short; or any bytes."""
+    action, side = random.randrange(4), random.choice((0, 1, 16_383))
+    if action == 0:
+        return _interrupted(data, random)
+    if action == 1:
+        canvas = random.choice((0, 99_999, 2**24 - 1)).to_bytes(3, "little")
+        chunk = b"VP8X" + struct.pack("<I4x", 10) + canvas + random.choice((canvas, b"\0\0\0")) + data[12:]
+        return b"RIFF" + struct.pack("<I", len(chunk) + 4) + b"WEBP" + chunk
+    if action == 2 and data[12:16] == b"VP8 ":
+        return data[:26] + struct.pack("<HH", side, random.choice((side, 40))) + data[30:]
+    if action == 2:
+        return data[:21] + struct.pack("<I", side | (random.choice((side, 31)) << 14)) + data[25:]
+    return damaged_file(data, random)
+
+
+def damaged_heic(data: bytes, random: Random) -> bytes:
+    """The sides that a box announces, the length or name of a box, a file cut short, or any bytes."""
+    action = random.randrange(5)
+    if action == 0:
+        return _interrupted(data, random)
+    if action == 1:
+        at = data.index(b"ispe") + random.choice((8, 12))
         return data[:at] + struct.pack(">I", random.choice(SIDES)) + data[at + 4 :]
-    at = data.find(b"VP8") + random.choice((14, 16))
-    return data[:at] + struct.pack("<H", random.choice(SIDES) % 2**16) + data[at + 2 :]
+    if action == 2:
+        boxes = [
+            match.start() for match in re.finditer(rb"ftyp|meta|hdlr|iloc|iinf|iprp|ipco|hvcC|ispe|ipma|mdat", data)
+        ]
+        at = random.choice(boxes)
+        if random.random() < 0.3:
+            return data[:at] + b"free" + data[at + 4 :]
+        return data[: at - 4] + struct.pack(">I", random.choice(LIES) % 2**32) + data[at:]
+    return damaged_file(data, random)
+
+
+def damaged_clip(data: bytes, random: Random) -> bytes:
+    """Times, sides or sizes of an MP4's boxes, the frames' bytes, a file cut short, or another kind of file."""
+    action = random.randrange(6)
+    if action == 0:
+        return data[: random.randrange(len(data))]
+    if action == 1:
+        return random.choice(
+            (b"", b"RIFF\0\0\0\0AVI ", b"#EXTM3U\nfile:///etc/hostname\n", b"ffconcat version 1.0\nfile 'x'\n")
+        )
+    if action < 4:
+        boxes = [
+            match.start() for match in re.finditer(rb"moov|mvhd|tkhd|mdhd|stsd|avc1|stts|stsz|stco|stsc|mdat", data)
+        ]
+        return with_lie(data, random.choice(boxes) + 4 * random.randrange(-1, 24), random)
+    return damaged_file(data, random)
 
 
 def damaged_gif(data: bytes, random: Random) -> bytes:

@@ -24,14 +24,15 @@ from random import Random
 from types import TracebackType
 from typing import Any
 
+from lapgs_plugin.errors import printable
 from tests.fuzz.worker import STOPPED
 
 MOST_BYTES = 1_500_000_000
 """Of the whole process, torch and all."""
 MOST_SECONDS = 60.0
 """Of a processor, which a busy machine gives no case more of."""
-MOST_WAITING = 900.0
-"""Seconds by the clock, for a case that does nothing."""
+MOST_WAITING = 60.0
+"""Seconds by the clock in which a case does nothing: it waits for something that never comes."""
 MOST_MORE = 4_000_000_000
 """What a case may ask of the system before that refuses: so much is a failure however it is reported."""
 START_SECONDS = 300.0
@@ -114,7 +115,7 @@ class Reader:
 
     Attributes:
         patience: seconds of a processor for a case.
-        waits: seconds by the clock for a case.
+        waits: seconds by the clock in which a case may do nothing.
         highest: most memory that the process ever had, in bytes.
         longest: seconds that a case took.
     """
@@ -149,9 +150,12 @@ class Reader:
         started = time.monotonic()
         process.stdin.write(json.dumps({"folder": str(folder), "command": list(command)}).encode() + b"\n")
         process.stdin.flush()
-        used, answer = self._used(), None
-        while answer is None and self._used() - used < self.patience and time.monotonic() - started < self.waits:
+        before = used = self._used()
+        worked, answer = started, None
+        while answer is None and used - before < self.patience and time.monotonic() - worked < self.waits:
             answer = self._read(min(1.0, self.waits))
+            if (now := self._used()) > used:
+                used, worked = now, time.monotonic()
         self.longest = max(self.longest, time.monotonic() - started)
         if answer is None:
             self._replace_child()
@@ -165,12 +169,17 @@ class Reader:
         return answer
 
     def _used(self) -> float:
-        """Seconds of a processor that the child has used; 0 where that is unknown, or the child is gone."""
-        try:
-            words = Path(f"/proc/{self._child}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            return 0.0
-        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+        """Seconds of a processor that the child and what it started have used; 0 where that is unknown."""
+        ticks = 0
+        family = [str(self._child)]
+        for process in family:
+            try:
+                words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+                ticks += sum(map(int, words[11:15]))  # with those of its children that have ended
+                family += Path(f"/proc/{process}/task/{process}/children").read_text().split()
+            except OSError:
+                continue
+        return ticks / os.sysconf("SC_CLK_TCK")
 
     @property
     def _log(self) -> Path:
@@ -257,15 +266,23 @@ class Fuzzer:
     def answer(self, case: Case) -> dict[str, Any] | Problem:
         """What `Reader.run` says of a case."""
         self.cases += 1
-        folder = self.scratch / "case"
+        folder, target = self.scratch / "case", self.scratch / "case" / case.kind.target
         shutil.rmtree(folder, ignore_errors=True)
         for name in case.kind.folders:
             shutil.copytree(self.templates / name, folder / name)
-        if case.kind.layout:
-            rearrange(folder / case.kind.target, json.loads(case.content))
-        else:
-            (folder / case.kind.target).write_bytes(case.content)
-        return self.reader.run([word.format(templates=self.templates) for word in case.command], folder)
+        command = [word.format(templates=self.templates) for word in case.command]
+        if not case.kind.layout:
+            target.write_bytes(case.content)
+            return self.reader.run(command, folder)
+        outside = self.scratch / "outside"
+        shutil.rmtree(outside, ignore_errors=True)
+        shutil.copytree(self.templates / case.kind.folders[0], outside)
+        before = _contents(outside)
+        named = rearrange(target, json.loads(case.content), outside)
+        answer = self.reader.run([f"./{named.name}" if word == case.kind.target else word for word in command], folder)
+        if _contents(outside) != before:
+            return Problem("wrote through a link", " ".join(command))
+        return answer
 
     def require_good(self, case: Case) -> None:
         """Fail with the way to try the case again, after keeping its file."""
@@ -290,44 +307,85 @@ class Fuzzer:
         return path
 
 
-LINKS = {"loop": None, "astray": "nowhere/at all", "device": "/dev/zero"}
-"""Actions of `rearrange` that put a link in the place of a path, and where it leads; None: to itself."""
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def rearrange(folder: Path, steps: Sequence[Sequence[str]]) -> None:
-    """Remove, replace and move what lies in a folder.
+def rearrange(folder: Path, steps: Sequence[Sequence[str]], outside: Path) -> Path:
+    """Remove, replace, move and rename what lies in a folder.
 
     Args:
         folder: nothing outside of it changes.
-        steps: an action, the path it is about, and for "move" another name, for "copy" another path. Those whose
-            paths a former step removed or whose other name a folder has are left out.
+        steps: an action, the path it is about, and for "move" and "rename" another name, for "copy" another path. Those
+            whose paths a former step removed or whose other name a folder has are left out. "rename" also changes the
+            name in the folder's texts, and of the path "" the folder's own name.
+        outside: a folder like it, which links of the action "outside" point to.
+
+    Returns:
+        The folder, by its new name if it has one.
     """
     for action, name, *other in steps:
         path = folder / name
-        if not path.exists() or os.path.normpath(path) == os.path.normpath(folder):
+        itself = os.path.normpath(path) == os.path.normpath(folder)
+        there = path.exists() or (action in SPECIAL and path.parent.is_dir())
+        if not there or (itself and action != "rename") or _through_link(path, folder):
             continue
-        target = folder / other[0] if other else path
-        if action == "copy" and not (path.is_file() and target.is_file()):
-            continue
-        if action == "copy":
-            target.write_bytes(path.read_bytes())
-            continue
-        if action == "move":
-            if not path.with_name(target.name).is_dir():
-                path.rename(path.with_name(target.name))
-            continue
-        if path.is_dir():
-            shutil.rmtree(path)
+        if action == "rename" and not name:
+            folder = folder.rename(folder.with_name(other[0]))
+        elif action == "rename":
+            _rename(folder, path, other[0])
+        elif action == "copy":
+            target = folder / other[0]
+            if path.is_file() and target.is_file() and not _through_link(target, folder):
+                target.write_bytes(path.read_bytes())
+        elif action == "move":
+            if not path.with_name(Path(other[0]).name).is_dir():
+                path.rename(path.with_name(Path(other[0]).name))
         else:
-            path.unlink()
-        if action == "folder":
-            path.mkdir()
-        elif action == "file":
-            path.touch()
-        elif action == "pipe":
-            os.mkfifo(path)
-        elif action in LINKS:
-            path.symlink_to(LINKS[action] or path.name)
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+            _put(action, path, outside / name)
+    return folder
+
+
+def _through_link(path: Path, folder: Path) -> bool:
+    """Whether a path in the folder is a link or lies behind one, as a former step made it."""
+    return os.path.realpath(path) != os.path.normpath(os.path.realpath(folder) + os.sep + os.path.relpath(path, folder))
+
+
+SPECIAL = {
+    "loop": "",
+    "zero": "/dev/zero",
+    "null": "/dev/null",
+    "up": "..",
+    "dangling": "/nonexistent/x",
+    "fifo": "",
+    "outside": "",
+}
+"""Links and what is no file; of the links with a fixed target that target."""
+
+
+def _put(action: str, path: Path, outside: Path) -> None:
+    """Make what lies at a path now; nothing for "remove"."""
+    if action == "folder":
+        path.mkdir()
+    elif action == "file":
+        path.touch()
+    elif action == "fifo":
+        os.mkfifo(path)
+    elif action in SPECIAL:
+        path.symlink_to({"loop": path.name, "outside": str(outside)}.get(action, SPECIAL[action]))
+
+
+def _rename(folder: Path, path: Path, name: str) -> None:
+    """Rename a file, also where a text of the folder names it."""
+    before, after = path.name, name + path.suffix
+    path.rename(path.with_name(after))
+    for text in (*folder.rglob("*.json"), *folder.rglob("*.txt")):
+        quoted = json.dumps(after)[1:-1] if text.suffix == ".json" else after
+        text.write_text(text.read_text().replace(before, quoted), errors="surrogateescape")
 
 
 def judged(answer: dict[str, Any], case: Case, folder: Path, templates: Path) -> Problem | None:
@@ -339,6 +397,8 @@ def judged(answer: dict[str, Any], case: Case, folder: Path, templates: Path) ->
         return Problem(f"more than {MOST_BYTES / 1e9:g} GB", message or answer["printed"])
     if answer["code"] not in (0, 2, STOPPED):
         return Problem(f"exit code {answer['code']}", message or answer["printed"])
+    if any(not (char.isprintable() or char in "\n\r\t") for char in answer["shown"]):
+        return Problem("control characters in its output", repr(answer["shown"]))
     if answer["code"] != 2:
         return None
     lines = message.split("\n") if case.kind.name == "experiment" else [message]  # all its mistakes are told
@@ -360,4 +420,6 @@ def _names_a_file(message: str, case: Case, folder: Path, templates: Path) -> bo
     """Whether a message names the damaged file, a folder that it lies in, or a scene that it speaks of."""
     parts = case.kind.target.split("/")
     names = [*parts, *case.kind.also, str(folder), str(templates)]
+    if case.kind.layout:
+        names += [printable(word) for step in json.loads(case.content) for word in step[1:] if word]
     return any(name in message for name in names)

@@ -9,22 +9,27 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
+from tests.fuzz import variants
 from tests.fuzz.formats import (
     damaged_ascii_ply,
+    damaged_clip,
     damaged_colmap,
     damaged_exr,
     damaged_gif,
+    damaged_heic,
     damaged_jpeg,
     damaged_lines,
-    damaged_phone_photo,
     damaged_ply,
     damaged_png,
     damaged_store,
     damaged_tensors,
     damaged_tiff,
+    damaged_webp,
+    stored_jpeg,
 )
-from tests.fuzz.harness import Damage, Kind
+from tests.fuzz.harness import SPECIAL, Damage, Kind
 from tests.fuzz.mutations import Emit, as_json, as_namespace, as_toml, damaged_document, damaged_file, damaged_text
+from tests.fuzz.variants import NAMES
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -61,10 +66,25 @@ def damaged_layout(data: bytes, random: Random) -> bytes:
     )
     steps = []
     for _ in range(random.choice((1, 1, 2))):
-        action = random.choice(("remove", "folder", "file", "loop", "astray", "device", "pipe", "move", "copy"))
+        action = random.choice(("remove", "folder", "file", "loop", "dangling", "zero", "fifo", "move", "copy"))
         other = {"move": [random.choice(names)], "copy": [random.choice(paths)]}.get(action, [])
         steps.append([action, random.choice(paths), *other])
     return json.dumps(steps).encode()
+
+
+def special_files(data: bytes, random: Random) -> bytes:
+    """Steps that put links and what is no file where files are, or where a command writes some."""
+    paths = [*data.decode().split("\n"), *WRITTEN]
+    steps = [[random.choice(list(SPECIAL)), random.choice(paths)] for _ in range(random.choice((1, 1, 2)))]
+    return json.dumps(steps).encode()
+
+
+def strange_names(data: bytes, random: Random) -> bytes:
+    """A step that renames the folder, a photo in it, or both."""
+    photos = [path for path in data.decode().split("\n") if path.endswith((".png", ".jpg"))]
+    names = [name for name in NAMES if "/" not in name]
+    paths = random.choice((["", random.choice(photos)], [""], [random.choice(photos)])) if photos else [""]
+    return json.dumps([["rename", path, random.choice(names)] for path in paths[::-1]]).encode()
 
 
 def _options(text: str) -> dict[str, Any]:
@@ -72,6 +92,9 @@ def _options(text: str) -> dict[str, Any]:
     assert isinstance(call, ast.Call)
     return {str(each.arg): ast.literal_eval(each.value) for each in call.keywords}
 
+
+WRITTEN = (".lock", "history.jsonl", "checkpoint.pt", "preview.png", "report.html", "metrics.json", "level_0", "export")
+"""What commands write into run folders."""
 
 JSON = _document(json.loads, as_json)
 TOML = _document(tomllib.loads, as_toml)
@@ -84,6 +107,10 @@ EXPORT = ("export", "run_done", "-o", "out")
 CLIP = ("render", "run_done", *ORACLE, "--trajectory", "path/trajectory.json", "-o", "clip")
 CONFIG = ("train", "{templates}/scene_json", "--config", "run_done/run.toml", *ORACLE, "-o", "run_new")
 TRAIN = ("--levels", "1", "--iterations", "4", *ORACLE, "-o", "run_new")
+
+
+def _prepare(suffix: str) -> tuple[str, ...]:
+    return ("prepare", f"scene_{suffix}/photos", "out")
 
 
 def _scene(name: str, target: str, damage: Damage, also: tuple[str, ...] = ()) -> Kind:
@@ -139,10 +166,6 @@ KINDS = (
         )
         for index in indices
     ),
-    *(
-        Kind(f"photo {suffix}", f"phone/0.{suffix}", damaged_phone_photo, [("convert-photo", f"phone/0.{suffix}")])
-        for suffix in ("heic", "webp")
-    ),
     Kind(
         "experiment",
         "bench/experiment.toml",
@@ -166,14 +189,44 @@ KINDS = (
     Kind("TRAIN_INFO", "foreign_levels/L1/TRAIN_INFO", _text, [("import-run", "foreign_levels", "-o", "out")]),
     Kind("breakdown", "foreign_levels/runtime_breakdown.json", JSON, [("import-run", "foreign_levels", "-o", "out")]),
     Kind("tables", "bench/tables.md", _text, [("report", "bench", *ORACLE)]),
-    Kind("run layout", "run_done", damaged_layout, [REPORT, EXPORT], layout=True),
-    Kind("run layout to resume", "run_part", damaged_layout, [RESUME], layout=True),
-    Kind("scene layout", "scene_json", damaged_layout, [("read-scene", "scene_json", "full")], layout=True),
-    Kind("COLMAP layout", "scene_bin", damaged_layout, [("read-scene", "scene_bin", "full")], layout=True),
-    Kind(
-        "foreign layout", "foreign_levels", damaged_layout, [("import-run", "foreign_levels", "-o", "out")], layout=True
+    Kind("settings of others", "run_done/run.toml", variants.config, [CONFIG]),
+    Kind("video", "video/clip.mp4", damaged_clip, [("prepare", "video/clip.mp4", "out")]),
+    *(
+        Kind(
+            f"prepared photo {name}", f"scene_{name[:-2]}/photos/{name[-1]}.{name[:-2]}", damage, [_prepare(name[:-2])]
+        )
+        for name, damage in (
+            ("jpg 0", stored_jpeg),
+            ("webp 0", damaged_webp),
+            ("webp 1", damaged_webp),
+            ("heic 0", damaged_heic),
+        )
     ),
-    Kind("experiment layout", "bench", damaged_layout, [("report", "bench", *ORACLE)], layout=True),
+    _scene("photo 1 webp", "scene_webp/photos/1.webp", damaged_webp),
+    _scene("stored jpg", "scene_jpg/photos/0.jpg", stored_jpeg),
+    _scene("transforms of others", "scene_json/transforms.json", variants.transforms),
+    _scene("points of others", "scene_json/points3d.ply", variants.points_ply),
+    *(
+        _scene(f"COLMAP {name} of others", f"scene_txt/sparse/0/{name}.txt", damage)
+        for name, damage in (
+            ("cameras", variants.colmap_cameras),
+            ("images", variants.colmap_images),
+            ("points3D", variants.colmap_points),
+        )
+    ),
+    *(
+        Kind(f"{name} {what}", folder, damage, commands, layout=True)
+        for name, folder, commands in (
+            ("run", "run_done", [REPORT, EXPORT]),
+            ("run to resume", "run_part", [RESUME]),
+            ("scene", "scene_json", [("read-scene", "scene_json", "full"), ("train", "scene_json", *TRAIN)]),
+            ("COLMAP", "scene_bin", [("read-scene", "scene_bin", "full"), ("train", "scene_bin", *TRAIN)]),
+            ("COLMAP text", "scene_txt", [("read-scene", "scene_txt", "full"), ("train", "scene_txt", *TRAIN)]),
+            ("foreign", "foreign_levels", [("import-run", "foreign_levels", "-o", "out")]),
+            ("experiment", "bench", [("report", "bench", *ORACLE)]),
+        )
+        for what, damage in (("layout", damaged_layout), ("links", special_files), ("names", strange_names))
+    ),
     Kind(
         "foreign field",
         "foreign/point_cloud/iteration_30/point_cloud.ply",

@@ -25,12 +25,6 @@ def trajectory(path: str) -> None:
     read_trajectory(Path(path))
 
 
-def phone_photo(path: str) -> None:
-    from lapgs_plugin.scenes.prepare.photos import convert_photo
-
-    convert_photo(Path(path), Path("out.jpg"))
-
-
 def recipes(folder: str) -> None:
     from lapgs_plugin.patching.recipe import load_recipes
 
@@ -50,6 +44,8 @@ def misbehave(how: str) -> None:
         raise UserInputError("it is damaged")
     if how == "raise":
         raise KeyError("scale_0")
+    if how == "follow":
+        Path("ascii/field.ply").write_text("through a link")
     if how == "abort":
         os.abort()
     if how == "exit":
@@ -71,7 +67,6 @@ READERS: dict[str, Callable[..., Any]] = {
     "read-scene": scene,
     "read-field": field,
     "read-trajectory": trajectory,
-    "convert-photo": phone_photo,
     "read-recipes": recipes,
     "misbehave": misbehave,
 }

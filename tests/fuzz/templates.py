@@ -9,6 +9,7 @@ foreign/       what a 3DGS codebase leaves; foreign_levels/ what the release doe
 bench/         an experiment's folder, experiment.toml beside its store
 recipes/       of `lapgs patch`
 path/          a trajectory
+video/         a clip
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pillow_heif
 import pycolmap
@@ -48,7 +50,7 @@ from tests.training_scene import blob_field, ring_camera
 SIZE = (40, 32)
 VIEWS = 3
 POINTS = 12
-PHOTOS = ("png", "jpg", "gif", "exr", "tif")
+PHOTOS = ("png", "jpg", "gif", "exr", "tif", "webp", "heic")
 
 
 def make_templates(folder: Path, reader: Reader) -> Path:
@@ -66,12 +68,9 @@ def make_templates(folder: Path, reader: Reader) -> Path:
     _write_runs(folder, reader)
     _write_ascii_field(folder)
     _write_foreign(folder)
+    _write_clip(folder / "video")
     _write_experiment(folder, reader)
     shutil.copytree(shipped("patches"), folder / "recipes")
-    pillow_heif.register_heif_opener()
-    for suffix in ("heic", "webp"):
-        (folder / "phone").mkdir(exist_ok=True)
-        write_photo(folder / "phone" / f"0.{suffix}", 0)
     (folder / "path").mkdir()
     (folder / "path" / "trajectory.json").write_text(as_json({**_intrinsics(), "frames": _frames(["a", "b"])}))
     return folder
@@ -125,6 +124,10 @@ def write_photo(path: Path, index: int) -> None:
         cv2.imwrite(str(path), _stripes(index).astype(np.uint16) * 257)
     elif path.suffix == ".png" and index == 2:
         picture.convert("P").save(path)
+    elif path.suffix == ".heic":
+        pillow_heif.from_pillow(picture).save(path)
+    elif path.suffix == ".webp":
+        picture.save(path, lossless=index == 1)
     elif path.suffix in (".tif", ".jpg") and index == 1:
         picture.convert("L").save(path)
     elif path.suffix == ".tif" and index == 2:
@@ -150,6 +153,7 @@ def _write_colmap(folder: Path, binary: bool) -> None:
     (model / "images.txt").write_text("\n".join(poses) + "\n")
     (model / "points3D.txt").write_text(
         "1 0.1 0.2 0.3 200 100 50 0.5 1 0 2 0 3 0\n2 -0.3 0.1 0.2 10 20 30 0.5 2 1 3 1\n"
+        + "".join(f"{number} 0.{number} -0.1 0.{number} 90 80 70 0.5\n" for number in range(3, 7))  # without tracks
     )
     (model / "rigs.txt").write_text("1 1 CAMERA 1\n")
     frames = [f"{index} 1 {' '.join(pose.split()[1:8])} 1 CAMERA 1 {index}" for index, pose in enumerate(poses[::2], 1)]
@@ -193,6 +197,15 @@ def _write_runs(folder: Path, reader: Reader) -> None:
     ]
     (done / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     _succeed(reader, folder, "eval", str(done), "--lpips", "none", "--rasterizer", "oracle")
+
+
+def _write_clip(folder: Path) -> None:
+    folder.mkdir()
+    writer = imageio_ffmpeg.write_frames(str(folder / "clip.mp4"), SIZE, fps=10, quality=10, macro_block_size=1)
+    writer.send(None)
+    for index in range(12):
+        writer.send(np.roll(_stripes(index), 3 * index, axis=1).tobytes())
+    writer.close()
 
 
 def _write_ascii_field(folder: Path) -> None:

@@ -23,7 +23,7 @@ from tests.fuzz.kinds import BY_NAME, KINDS
 from tests.fuzz.mutations import as_json, as_namespace, as_toml, damaged_tree
 from tests.fuzz.worker import STOPPED
 
-CASES = 12
+CASES = 8
 """Of each kind in `make test`."""
 MANY_CASES = 6_000
 
@@ -90,7 +90,7 @@ def misbehaving(how: str) -> Case:
     ],
 )
 def test_a_message_is_a_line_of_text(message: str, what: str) -> None:
-    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": ""}
+    answer = {"message": message, "trace": "", "highest": 0, "starved": False, "code": 2, "printed": "", "shown": ""}
     problem = judged(answer, misbehaving("nothing"), Path("case"), Path("templates"))
     assert problem is not None
     assert problem.what == what
@@ -101,6 +101,21 @@ def test_every_broken_rule_is_told(fuzzer: Fuzzer, how: str) -> None:
     problem = fuzzer.problem(misbehaving(how))
     assert problem is not None
     assert problem.what.startswith(HOW[how])
+
+
+def test_a_file_outside_that_a_command_writes_through_a_link_is_told(fuzzer: Fuzzer) -> None:
+    kind = Kind("links", "ascii", lambda data, random: data, [("misbehave", "follow")], layout=True)
+    problem = fuzzer.problem(Case(kind, b'[["outside", "field.ply"]]', kind.commands[0]))
+    assert problem is not None
+    assert problem.what == "wrote through a link"
+    assert fuzzer.problem(Case(kind, b"[]", kind.commands[0])) is None
+
+
+def test_control_characters_in_what_a_command_prints_are_told() -> None:
+    answer = {"message": "", "trace": "", "highest": 0, "starved": False, "code": 0, "printed": ""}
+    for shown, what in (("made out\n", None), ("made \x1b[2J\n", "control characters in its output")):
+        problem = judged({**answer, "shown": shown}, misbehaving("nothing"), Path("case"), Path("templates"))
+        assert (problem and problem.what) == what
 
 
 def test_a_process_that_ends_hangs_or_grows_is_told_and_started_again(

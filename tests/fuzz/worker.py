@@ -85,7 +85,8 @@ def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -
     """How a command ended: its exit code, its message or the traceback that escaped, its seconds and bytes."""
     from lapgs_plugin.errors import LapgsError, TrainingDivergedError
 
-    out, errors = io.StringIO(), io.StringIO()
+    out = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)  # as strict as a terminal's
+    errors = io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace", write_through=True)
     code, message, trace, starved = 0, "", "", False
     started = time.monotonic()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
@@ -104,10 +105,19 @@ def _outcome(commands: Callable[[Sequence[str]], Any], command: Sequence[str]) -
         "message": message,
         "trace": trace,
         "starved": starved,
-        "printed": errors.getvalue()[-2000:],
+        "printed": (printed := _text(errors))[-2000:],
+        "shown": (_text(out) + printed)[-20_000:],
         "seconds": time.monotonic() - started,
         "highest": _highest(),
     }
+
+
+def _text(stream: io.TextIOWrapper) -> str:
+    """All that was written to a stream."""
+    stream.flush()
+    buffer = stream.buffer
+    assert isinstance(buffer, io.BytesIO)
+    return buffer.getvalue().decode("utf-8", "replace")
 
 
 def _short_trace(error: BaseException) -> str:
@@ -138,6 +148,7 @@ def _prepared() -> Callable[[Sequence[str]], Any]:
 
     torch.set_num_threads(1)
     _stop_training_early()
+    _stop_preparing_early()
     _compile_templates_once(jinja2)
     lapgs = typer.main.get_command(app)
 
@@ -172,6 +183,18 @@ def _stop_training_early() -> None:
         whole(stage_run, after)
 
     StageRun.run = run  # type: ignore[method-assign]
+
+
+def _stop_preparing_early() -> None:
+    """End `lapgs prepare` when photos and masks have been read: COLMAP's steps take long and read none of them anew."""
+    from lapgs_plugin.errors import TrainingStoppedError
+    from lapgs_plugin.scenes.prepare import pipeline
+
+    def stop(*_: Any) -> None:
+        raise TrainingStoppedError("as far as this test goes")
+
+    assert hasattr(pipeline, "find_features")
+    pipeline.find_features = stop
 
 
 def _compile_templates_once(jinja2: Any) -> None:

@@ -46,6 +46,12 @@ def test_ticks_are_round_few_and_enclose_the_data(low: float, span: float) -> No
     assert steps == pytest.approx([steps[0]] * len(steps), rel=1e-6)
 
 
+@pytest.mark.parametrize(("points", "dots"), [(1, 1), (2, 2), (20, 20), (21, 1)])
+def test_few_points_are_marked_and_else_the_last(points: int, dots: int) -> None:
+    (line,) = draw_lines("t", "x", [Series("run", [(x, x * x) for x in range(points)])]).lines
+    assert line.dots == line.points[-dots:]
+
+
 def test_points_lie_where_the_axes_say() -> None:
     chart = draw_lines("t", "x", [Series("run", [(0, 0), (5, 40), (10, 100)])], marks=[Mark(5, "half")])
     top = float(chart.y_ticks[-1].label)

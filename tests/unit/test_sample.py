@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample import scene as scene_module
 from lapgs_plugin.scenes.sample.cameras import orbit_camera
 from lapgs_plugin.scenes.sample.points import NOISE
+from lapgs_plugin.scenes.sample.ray_kernels import nearest_hits
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
 from lapgs_plugin.scenes.sample.world import build_world
@@ -260,6 +262,13 @@ SOLIDS: dict[str, tuple[Solid, Inside]] = {
 }
 
 
+def _hit(solid: Solid, origin: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Distances (n,) at which rays hit one solid."""
+    distance, index = np.empty(directions.shape[1], np.float32), np.empty(directions.shape[1], np.intp)
+    nearest_hits(solid.row[None], origin, directions, distance, index)
+    return distance
+
+
 def _rays(count: int, spread: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A point and directions (3, count) from it towards the solids."""
     origin = np.array([1.3, -1.9, 1.1])
@@ -273,7 +282,7 @@ def test_rays_hit_solids_where_marching_along_them_does(name: str) -> None:
     origin, directions = _rays(300, 0.015 if name == "wire" else 0.5)
     step = 3e-4 if name == "wire" else 2e-3
     ways = np.arange(0, 8, step) if name == "hall" else np.arange(0.5, 4.0, step)
-    distance = solid.hit(origin.astype(np.float32), directions.astype(np.float32))
+    distance = _hit(solid, origin.astype(np.float32), directions.astype(np.float32))
     hits = disagreements = 0
     for ray in range(300):
         entered = np.flatnonzero(inside(origin[:, None] + ways * directions[:, ray : ray + 1]))
@@ -286,11 +295,35 @@ def test_rays_hit_solids_where_marching_along_them_does(name: str) -> None:
     assert disagreements <= 3  # none seen
 
 
+def test_rays_hit_a_box_as_by_numpy_in_a_fraction_of_the_processor_time() -> None:
+    """Compiled loops keep `lapgs sample` from taking minutes of a processor: NumPy goes through memory at each step."""
+    size = np.array([[0.9], [0.6], [1.1]], np.float32)
+    solid = box((0.0, 0.0, 0.0), tuple(size.ravel().tolist()), _no_paint)
+    origin, directions = (each.astype(np.float32) for each in _rays(200_000, 0.5))
+
+    def by_numpy() -> NDArray[np.float32]:
+        low, high = ((side * size / 2 - origin[:, None]) / directions for side in (-1, 1))
+        enter, leave = np.minimum(low, high).max(axis=0), np.maximum(low, high).min(axis=0)
+        return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+    def seconds(function: Callable[[], object]) -> float:
+        taken = []
+        for _ in range(3):
+            begin = time.process_time()
+            function()
+            taken.append(time.process_time() - begin)
+        return min(taken)
+
+    np.testing.assert_allclose(_hit(solid, origin, directions), by_numpy(), rtol=1e-5)
+    ours, numpys = seconds(lambda: _hit(solid, origin, directions)), seconds(by_numpy)
+    assert ours < 0.5 * numpys, (ours, numpys)  # seen 0.21 to 0.24
+
+
 @pytest.mark.parametrize("name", SOLIDS)
 def test_normals_stand_on_the_surface(name: str) -> None:
     solid, inside = SOLIDS[name]
     origin, directions = _rays(2000, 0.015 if name == "wire" else 0.3)
-    distance = solid.hit(origin.astype(np.float32), directions.astype(np.float32))
+    distance = _hit(solid, origin.astype(np.float32), directions.astype(np.float32))
     hit = np.isfinite(distance)
     points = (origin[:, None] + distance[hit] * directions[:, hit]).astype(np.float32)
     _, normals = solid.surface(points)
@@ -308,7 +341,7 @@ def test_blocks_of_an_image_miss_no_solid() -> None:
     for left in range(0, 480, 96):
         columns, rows = np.meshgrid(np.arange(left, left + 96, 3) + 0.5, np.arange(0, 320, 40) + 0.5)
         origin, directions = camera_rays(camera, np.stack([columns.ravel(), rows.ravel()]))
-        nearest = np.min([solid.hit(origin, directions) for solid in world], axis=0)
+        nearest = np.min([_hit(solid, origin, directions) for solid in world], axis=0)
         np.testing.assert_array_equal(first_hits(world, origin, directions)[0], nearest)
 
 

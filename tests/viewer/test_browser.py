@@ -47,6 +47,16 @@ from lapgs_plugin.cli import main
 main()
 """
 
+COVERED = """() => {
+  let covered = 0;
+  for (let x = 5; x < innerWidth; x += 10)
+    for (let y = 5; y < innerHeight; y += 10)
+      covered += !["CANVAS", "HTML"].includes(document.elementFromPoint(x, y)?.tagName)
+        && !document.elementFromPoint(x, y)?.closest("[class*=Notification]");
+  return covered * 100 / (innerWidth * innerHeight);
+}"""
+"""Share of the window over which something lies that is no picture and no message of the browser's."""
+
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
@@ -216,3 +226,20 @@ def test_frustums_and_figures(page: Any) -> None:
         assert page.get_by_role("cell", name=text, exact=True).count() == 1
     page.get_by_label("frustums", exact=True).check()
     wait_for(page, lambda image: difference(image, before) > 0.2)
+
+
+@pytest.mark.parametrize("size", [(390, 844), (844, 390)], ids=["upright", "on its side"])
+def test_on_a_phone_the_controls_are_opened_by_a_tap(browser: Any, address: str, size: tuple[int, int]) -> None:
+    width, height = size
+    with browser.new_context(
+        viewport={"width": width, "height": height}, has_touch=True, is_mobile=True, device_scale_factor=2
+    ) as context:
+        page = context.new_page()
+        page.goto(address)
+        controls = page.get_by_text("Controls", exact=True).first
+        controls.wait_for(timeout=1e3 * PATIENCE)
+        playwright.expect(page.get_by_text("Bands", exact=True)).not_to_be_in_viewport(timeout=1e3 * PATIENCE)
+        covered = page.evaluate(COVERED)
+        assert covered < 0.25, "most of the window shows the picture"  # seen 0.10 upright and 0.08 on its side
+        controls.tap()
+        playwright.expect(page.get_by_text("Bands", exact=True)).to_be_in_viewport(timeout=1e3 * PATIENCE)

@@ -23,6 +23,8 @@ MIN_SIDE = 16
 MAX_SIDE = 8192
 MAX_VIEWS = 9999  # names of four digits sort as numbers
 MAX_POINTS = 1_000_000
+MOST_THREADS = 4
+"""Threads that render; patterns are painted by small NumPy operations, in which more threads wait for each other."""
 
 
 def make_sample_scene(
@@ -89,7 +91,7 @@ def _write_images(folder: Path, world: World, cameras: Sequence[Camera], progres
         image = torch.from_numpy(render(world, cameras[view]))  # (h, w, 3)
         write_image(folder / f"{view:04d}.png", image.permute(2, 0, 1))
 
-    in_threads("Rendering images", "images", write, range(len(cameras)), progress=progress)
+    in_threads("Rendering images", "images", write, range(len(cameras)), most=MOST_THREADS, progress=progress)
 
 
 def _write_model(folder: Path, cameras: Sequence[Camera], points: SparsePoints) -> None:

@@ -1,13 +1,13 @@
-"""Intersect rays with solids: boxes, balls, cylinders and wires, which are one shape with different numbers.
+"""Define solids: boxes, balls, cylinders and wires, which are one shape with different numbers.
 
-Vectors are float32 (3, n), so that each coordinate is contiguous. Rays start at one point and have unit directions.
+Vectors are float32 (3, n), so that each coordinate is contiguous.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce  # several times faster along the first axis than numpy's
+from functools import cached_property, reduce  # `reduce` is several times faster along the first axis than numpy's
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,29 +52,12 @@ class Solid:
     paint: Paint
     room: bool = False
 
-    def hit(self, origin: Floats, directions: Floats) -> Floats:
-        """Return the distance (n,) at which rays from `origin` (3,) first hit the surface; inf if they miss."""
-        start, ways = self.rotation.T @ (origin - self.origin), rotate(self.rotation.T, directions)
-        distance = np.full(ways.shape[1], np.inf, np.float32)
-        scale = np.float32(1) / self.axes
-        u, v = scale * start, scale[:, None] * ways
-        with np.errstate(divide="ignore", invalid="ignore"):
-            which, enter, leave = np.arange(len(distance)), np.float32(-np.inf), np.float32(np.inf)
-            if scale.any():
-                # The discriminant from the moment u x v does not cancel: thin wires far away keep their digits.
-                square = dot(v, v)
-                moment = [u[i - 2] * v[i - 1] - u[i - 1] * v[i - 2] for i in range(3)]
-                free = square - dot(moment, moment)
-                which = np.flatnonzero(free > 0)
-                root, middle, square = np.sqrt(free[which]), -dot(u, v)[which], square[which]
-                enter, leave = (middle - root) / square, (middle + root) / square
-            inverse = 1 / ways[:, which]
-            low, high = (-self.half - start)[:, None] * inverse, (self.half - start)[:, None] * inverse
-            enter = np.maximum(enter, reduce(np.maximum, np.minimum(low, high)))
-            leave = np.minimum(leave, reduce(np.minimum, np.maximum(low, high)))
-            valid = (enter <= leave) & (enter > 0)
-        distance[which] = leave if self.room else np.where(valid, enter, np.inf)
-        return distance
+    @cached_property
+    def row(self) -> Floats:
+        """The numbers that `ray_kernels.nearest_hits` takes."""
+        return np.concatenate(
+            [self.half, np.float32(1) / self.axes, self.rotation.ravel(), self.origin, [np.float32(self.room)]]
+        ).astype(np.float32)
 
     def surface(self, points: Floats) -> tuple[Codes, Floats]:
         """Return palette indices (n,) and outward unit normals (3, n) at world points (3, n) on the surface."""
