@@ -12,6 +12,7 @@ import typer
 
 from lapgs_plugin.cli.output import say
 from lapgs_plugin.errors import PatchError
+from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.patching.engine import ALL_SETS, FileChange, Target, find_targets, plan_apply, plan_revert, status
 from lapgs_plugin.patching.files import alone, read_only, uncommitted, write_all
 
@@ -25,8 +26,10 @@ def _root(path: Path) -> Path:
     """Return the root of the checkout that a training script, or a folder of such scripts, is in; else the path."""
     from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
 
-    if path.is_file():
+    if path.suffix == ".py" and is_file(path):
         return CheckoutSource.read(path).root
+    if not is_folder(path):
+        return path
     sources, _ = readable_sources(path)
     inside = [source.root for source in sources if path.absolute().is_relative_to(source.root)]
     return inside[0] if inside and inside[0] != path.absolute() else path
