@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
+from lapgs_bench.experiments.expansion import PlannedRun
+from lapgs_bench.experiments.exports import Row
+from lapgs_bench.experiments.schema import Experiment
+from lapgs_bench.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.errors import RunFolderError, UserInputError, nearest
-from lapgs_plugin.experiments.expansion import PlannedRun
-from lapgs_plugin.experiments.exports import Row
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.untrusted import shortened
 
 LEVELS = "_level_"

@@ -17,14 +17,14 @@ from typing import Any, cast
 
 import typer
 
+from lapgs_bench.experiments.commands import LAPGS
+from lapgs_bench.experiments.expansion import PlannedRun, RunSpec, SceneSpec
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.store import Job
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
-from lapgs_plugin.experiments.commands import LAPGS
-from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec, SceneSpec
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.limits import LONGEST_STEM

@@ -11,10 +11,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lapgs_bench.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.adapters.info import RASTER_OPTIONS
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.runner.settings import RunSettings

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from lapgs_bench.experiments.commands import Locations, defaults_of, run_steps
+from lapgs_bench.experiments.expansion import PlannedRun, SceneSpec
+from lapgs_bench.experiments.launchers import Launcher
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.schema import SampleScene
+from lapgs_bench.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
-from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
-from lapgs_plugin.experiments.launchers import Launcher
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.schema import SampleScene
-from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 from lapgs_plugin.scenes.resolution import parse_size
 

@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
+from lapgs_bench.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.errors import UserInputError, nearest
-from lapgs_plugin.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
 from lapgs_plugin.untrusted import STRICT
 

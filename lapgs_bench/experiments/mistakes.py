@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lapgs_bench.experiments.expansion import PlannedRun
+from lapgs_bench.experiments.schema import Experiment, ExperimentError
+from lapgs_bench.experiments.settings import Selection
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.expansion import PlannedRun
-from lapgs_plugin.experiments.schema import Experiment, ExperimentError
-from lapgs_plugin.experiments.settings import Selection
 
 
 class Mistakes:

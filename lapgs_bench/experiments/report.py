@@ -13,10 +13,10 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
+from lapgs_bench.experiments.commands import IMPORTED
+from lapgs_bench.experiments.execution import RUNS
+from lapgs_bench.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.errors import LapgsError, RunFolderError
-from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.execution import RUNS
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.files import is_folder, write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer

@@ -11,8 +11,20 @@ from typing import Any
 from rich.markdown import Markdown
 from rich.markup import escape
 
+from lapgs_bench.experiments import exports
+from lapgs_bench.experiments.aggregate import baseline_of, check_table, make_table
+from lapgs_bench.experiments.checks import READS_SCENES, check_runs
+from lapgs_bench.experiments.commands import Locations
+from lapgs_bench.experiments.execution import LOGS, STORE, execute, make_samples, prepare
+from lapgs_bench.experiments.expansion import PlannedRun, plan_runs, scenes_of
+from lapgs_bench.experiments.launchers import WorkOrder, check_launcher, launch
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.schema import Experiment, load_experiment
+from lapgs_bench.experiments.settings import BenchSettings, WorkerSettings
+from lapgs_bench.experiments.standard import experiment_file
+from lapgs_bench.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
+from lapgs_bench.experiments.tables import latex, markdown
 from lapgs_plugin import __version__
-from lapgs_plugin.cli.bench_check import READS_SCENES, check_runs
 from lapgs_plugin.cli.output import make_console, say
 from lapgs_plugin.cli.run import run as run_script
 from lapgs_plugin.cli.train import train
@@ -24,18 +36,6 @@ from lapgs_plugin.errors import (
     UserInputError,
     printable_lines,
 )
-from lapgs_plugin.experiments import exports
-from lapgs_plugin.experiments.aggregate import baseline_of, check_table, make_table
-from lapgs_plugin.experiments.commands import Locations
-from lapgs_plugin.experiments.execution import LOGS, STORE, execute, make_samples, prepare
-from lapgs_plugin.experiments.expansion import PlannedRun, plan_runs, scenes_of
-from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.schema import Experiment, load_experiment
-from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
-from lapgs_plugin.experiments.standard import experiment_file
-from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
-from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.runs.layout import require_place, require_utf8

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from lapgs_bench.experiments.standard import DATASETS, EXPERIMENTS, PRESETS
 from lapgs_plugin.errors import UserInputError, nearest
-from lapgs_plugin.experiments.standard import DATASETS, EXPERIMENTS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 

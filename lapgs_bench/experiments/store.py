@@ -23,10 +23,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.expansion import RunSpec
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.files import one_line_errors, require_own
 from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 

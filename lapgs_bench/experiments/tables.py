@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from lapgs_plugin.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
+from lapgs_bench.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
 
 GROUPS_BESIDE = 3
 """Data sets or scenes side by side in a LaTeX table, as in the paper."""

@@ -15,11 +15,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.store import LEASE, Claim, ResultStore
 from lapgs_plugin import __version__
 from lapgs_plugin.environment import run_program, versions
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 from lapgs_plugin.files import require_own
 
 RENEW_EVERY = LEASE / 8
@@ -86,7 +86,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
         RunStopped: it was killed.
         LapgsError: it failed.
     """
-    from lapgs_plugin.experiments.rows import result_row
+    from lapgs_bench.experiments.rows import result_row
 
     job = claim.job
     folder = Path(job.folder)
@@ -135,7 +135,7 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
     environment["PYTHONUNBUFFERED"] = "1"
     cores = ",".join(map(str, slot.cores)) or "-"
     process = subprocess.Popen(
-        [sys.executable, "-m", "lapgs_plugin.experiments.leash", cores, *step.command],
+        [sys.executable, "-m", "lapgs_bench.experiments.leash", cores, *step.command],
         cwd=step.cwd,
         env=environment,
         stdin=subprocess.PIPE,

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lapgs_bench.kernels.random_scene import make_scene
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.bench_scene import make_scene
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import bindings, direct
@@ -149,7 +149,7 @@ def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
     return Kernels(partial(blend_forward, *given, size, shape), backward, parts)
 
 
-def run_case(
+def time_kernels(
     field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: Mapping[str, Shape]
 ) -> Iterator[BlendTime]:
     """Time all kernels for some views of a field, in turns."""

@@ -22,9 +22,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lapgs_bench.kernels.random_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.environment import installed_version, versions
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.limits import usable_processors
@@ -252,7 +252,7 @@ def _contenders(scene: BenchScene) -> dict[str, _Contender]:
 
     found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if GSPLAT in contender_names(scene.target.dtype):
-        from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
+        from lapgs_bench.kernels.gsplat_on_cpu import GsplatTorchRasterizer
 
         found[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
     return found

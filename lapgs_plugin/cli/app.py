@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from lapgs_bench.app import bench_app
 from lapgs_plugin import __version__, interrupt
 from lapgs_plugin.cli import patch
-from lapgs_plugin.cli.bench import bench_app
 from lapgs_plugin.cli.config_file import naming_the_config
 from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor

@@ -40,8 +40,8 @@ def report(
     run without metrics is measured first, as by `lapgs eval`. For a folder of `lapgs bench`, the page shows its tables
     and the scenes whose runs still exist.
     """
+    from lapgs_bench.experiments.exports import CSV
     from lapgs_plugin.evaluation.figures import run_metrics
-    from lapgs_plugin.experiments.exports import CSV
     from lapgs_plugin.reports.report import MeasuredRun, write_report
     from lapgs_plugin.runs.archive import RunArchive
 
@@ -51,7 +51,7 @@ def report(
             raise UserInputError(
                 f"{run} is an experiment with baselines and scenes of its own; leave out --baseline and --scene"
             )
-        from lapgs_plugin.experiments.report import write_experiment_report
+        from lapgs_bench.experiments.report import write_experiment_report
 
         show_log()
         page = write_experiment_report(run, options)
@@ -71,7 +71,7 @@ def _newest(folder: Path) -> Path:
     Raises:
         RunFolderError: there is none.
     """
-    from lapgs_plugin.experiments.exports import CSV
+    from lapgs_bench.experiments.exports import CSV
     from lapgs_plugin.files import MANIFEST
 
     patterns = [f"*/{MANIFEST}", f"*/*/{MANIFEST}", f"*/{CSV}", f"*/*/{CSV}"]

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from lapgs_bench.experiments.exports import write_csv
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
-from lapgs_plugin.experiments.exports import write_csv
 from lapgs_plugin.files import write_text
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene

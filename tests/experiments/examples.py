@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.expansion import RunSpec
-from lapgs_plugin.experiments.store import Job
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.expansion import RunSpec
+from lapgs_bench.experiments.store import Job
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference

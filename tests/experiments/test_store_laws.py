@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
-from lapgs_plugin.experiments import store as store_module
-from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, RUNNING, Claim, Job, ResultStore
+from lapgs_bench.experiments import store as store_module
+from lapgs_bench.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, RUNNING, Claim, Job, ResultStore
 from tests.experiments.examples import run_spec
 
 RUNS = 3
