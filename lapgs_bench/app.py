@@ -1,4 +1,4 @@
-"""Run experiments and benchmarks: `lapgs bench`."""
+"""Run an experiment, or benchmark one part of the package."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from lapgs_plugin.files import is_folder, write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
+from lapgs_plugin.reports.folders import FolderReport
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
 from lapgs_plugin.runs.archive import RunArchive
@@ -28,7 +29,7 @@ from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.untrusted import read_text, shortened
 
-TEMPLATE = "experiment.html.jinja"
+TEMPLATE = Path(__file__).with_name("experiment.html.jinja")
 COLORS = 8
 """Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
@@ -102,28 +103,28 @@ class Results:
         return f"{scene}, {backbone}" if several else scene
 
 
-def write_experiment_report(folder: Path, options: RenderOptions) -> Path:
-    """Write report.html into a folder of `lapgs bench`, and return its path.
+class ExperimentReport(FolderReport):
+    """Report on a folder of `lapgs bench`."""
 
-    Raises:
-        RunFolderError: there are no results, or the file cannot be written.
-    """
-    results = Results.read(folder)
-    title, tables = _tables(folder / MARKDOWN)
-    page = render_page(
-        TEMPLATE,
-        title=title or str(results.rows[0].get("experiment", folder.name)),
-        tables=tables,
-        variants={name: results.style(name) for name in results.variants},
-        num_runs=len({row["run"] for row in results.rows}),
-        arrows=_time_arrows(results),
-        breakdown=_breakdown(results),
-        overhead=_overhead(results),
-        parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
-        machines=_machines(results),
-    )
-    write_text(folder / REPORT, page)
-    return folder / REPORT
+    marker = CSV
+
+    def write(self, folder: Path, options: RenderOptions) -> Path:
+        results = Results.read(folder)
+        title, tables = _tables(folder / MARKDOWN)
+        page = render_page(
+            TEMPLATE,
+            title=title or str(results.rows[0].get("experiment", folder.name)),
+            tables=tables,
+            variants={name: results.style(name) for name in results.variants},
+            num_runs=len({row["run"] for row in results.rows}),
+            arrows=_time_arrows(results),
+            breakdown=_breakdown(results),
+            overhead=_overhead(results),
+            parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
+            machines=_machines(results),
+        )
+        write_text(folder / REPORT, page)
+        return folder / REPORT
 
 
 def _tables(path: Path) -> tuple[str, str]:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 import lapgs_plugin
 from lapgs_plugin import ops
-from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.adapters.registry import adapter_class
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
@@ -32,8 +32,8 @@ from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes.sample import make_sample_scene
-from lapgs_plugin.training.strategies import STRATEGIES
 from tests.docs.documents import ROOT, blocks
+from tests.plugin_package import REGISTRIES
 
 try:
     import tomllib
@@ -61,15 +61,12 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     monkeypatch.syspath_prepend(tmp_path)
     for registry in REGISTRIES:
-        vars(registry).pop("_found", None)
+        vars(registry).pop("entries", None)
     yield tmp_path
     for registry in REGISTRIES:
-        vars(registry).pop("_found", None)
+        vars(registry).pop("entries", None)
     for name in [name for name in sys.modules if name.split(".")[0] == "my_extension"]:
         del sys.modules[name]
-
-
-REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES, RASTERIZERS)
 
 
 def context(signed: bool) -> StageContext:
