@@ -170,7 +170,7 @@ def test_the_newest_run_or_experiment_is_reported_on(
 
 
 def test_mistakes(experiment: Path) -> None:
-    with pytest.raises(UserInputError, match="is an experiment with baselines and scenes of its own"):
+    with pytest.raises(UserInputError, match="has baselines and scenes of its own; leave out --baseline"):
         lapgs_report(experiment, "--baseline", experiment / "runs" / "0-cpu-1-0")
     (experiment / "results.csv").write_text("name,value\na,1\n")
     with pytest.raises(
