@@ -28,9 +28,6 @@ def main() -> int:
 def _kill_when_released(child: subprocess.Popen[bytes]) -> None:
     while os.read(sys.stdin.fileno(), 1):  # unbuffered, because a buffer's lock would block the end of this process
         pass
-    if sys.platform == "win32":
-        child.kill()
-        return
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
 

@@ -247,11 +247,7 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:
-    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved.
-
-    Raises:
-        RunFolderError: it is missing or damaged.
-    """
+    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved."""
     path = folder / RUNS / Path(str(row.get("folder", row["run"]))).name
     archive = RunArchive.open(path / IMPORTED if is_folder(path / IMPORTED) else path)
     return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from rich.markup import escape
 
 from lapgs_bench.experiments import exports
 from lapgs_bench.experiments.aggregate import baseline_of, check_table, make_table
-from lapgs_bench.experiments.checks import READS_SCENES, check_runs
+from lapgs_bench.experiments.checks import check_runs
 from lapgs_bench.experiments.commands import Locations
 from lapgs_bench.experiments.execution import LOGS, STORE, execute, make_samples, prepare
 from lapgs_bench.experiments.expansion import PlannedRun, plan_runs, scenes_of
@@ -94,23 +93,13 @@ def _option_names() -> dict[str, set[str]]:
 
 
 def _measuring(settings: BenchSettings) -> list[str] | None:
-    """Return the options of `lapgs eval`, None without it.
-
-    Raises:
-        UserInputError: a package that reads scenes or a file of weights is missing.
-    """
+    """Return the options of `lapgs eval`, None without it."""
     if not settings.evaluate:
         return None
     weights = settings.lpips_weights or []
     for file in weights:
         if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
-    missing = [name for name in READS_SCENES if find_spec(name) is None]
-    if missing:
-        raise UserInputError(
-            f"{' and '.join(missing)} cannot be imported, and `lapgs eval` needs them to read scenes; install them, or "
-            "use the metrics that training records with --no-eval"
-        )
     return [word for file in weights for word in ("--lpips-weights", str(file.absolute()))]
 
 
@@ -153,11 +142,7 @@ def _summary(record: dict[str, Any]) -> str:
 
 
 def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) -> None:
-    """Write the results, print their table, and report the runs that failed.
-
-    Raises:
-        RunsFailedError: some did.
-    """
+    """Write the results, print their table, and report the runs that failed."""
     path = folder / STORE
     outcomes = {o.run_id: o for o in ResultStore(path).outcomes({run.spec.run_id for run in planned})}
     records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}

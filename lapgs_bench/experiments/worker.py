@@ -80,12 +80,7 @@ class RunFailedError(LapgsError):
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
-    """Train and evaluate one run.
-
-    Raises:
-        RunStopped: it was killed.
-        LapgsError: it failed.
-    """
+    """Train and evaluate one run, and return its row of results."""
     from lapgs_bench.experiments.rows import result_row
 
     job = claim.job
@@ -120,11 +115,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
 
 def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> int:
-    """Run one command and return its exit code; it is killed when this process ends.
-
-    Raises:
-        RunStopped: it was killed.
-    """
+    """Run one command and return its exit code; it is killed when this process ends."""
     log.write(f"$ {' '.join(step.command)}\n".encode())
     log.flush()
     environment = dict(os.environ)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -95,13 +96,11 @@ def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> li
     with item_progress("turns") as progress:
         task = progress.add_task("preparing", total=turns)
 
-        def advance(name: str) -> None:
-            progress.update(task, description=f"{case.name} {name}", advance=1)
+        def measure(case: BenchCase) -> CaseResult:
+            show = partial(progress.update, task, advance=1)
+            return run_case(case, repeats, dtype, lambda name: show(description=f"{case.name} {name}"))
 
-        results = []
-        for case in cases:
-            results.append(run_case(case, repeats, dtype, advance))
-    return results
+        return [measure(case) for case in cases]
 
 
 def _print_results(results: Sequence[CaseResult]) -> None:

@@ -143,7 +143,7 @@ def test_results_of_another_version_are_named(experiment: Path) -> None:
     out = experiment.parent / "out"
     planned = plan_runs(load_experiment(experiment, _option_names()), Selection())
     store = ResultStore.create(out / "results.sqlite")
-    store.plan([Job(run.spec.run_id, run.spec, "", "", (), True) for run in planned])
+    store.plan([Job(run.spec.run_id, run.spec, "", "", (), True, "{}") for run in planned])
     claim = store.claim([planned[0].spec.run_id])
     assert claim is not None
     store.record(claim, {"psnr": 20.0, "train_seconds": 1.0, "lapgs_version": "0.0.9"})

@@ -101,7 +101,7 @@ def starts(folder: Path) -> Counter[str]:
 
 def _job(folder: Path, spec: RunSpec, command: Sequence[str]) -> Job:
     own, log = folder / "runs" / spec.run_id, folder / "logs" / f"{spec.run_id}.log"
-    return Job(spec.run_id, spec, str(own), str(log), (Step(tuple(command), str(folder)),), True)
+    return Job(spec.run_id, spec, str(own), str(log), (Step(tuple(command), str(folder)),), True, "{}")
 
 
 def _python(code: str) -> tuple[str, ...]:

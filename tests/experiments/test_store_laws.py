@@ -29,7 +29,7 @@ class Workers(RuleBasedStateMachine):
         self.now = 1e9
         self.clock = mock.patch.object(store_module.time, "time", self.read_clock)
         self.clock.start()
-        self.jobs = [Job(f"run{i}", run_spec(i), "", "", (), True) for i in range(RUNS)]
+        self.jobs = [Job(f"run{i}", run_spec(i), "", "", (), True, "{}") for i in range(RUNS)]
         self.store = ResultStore.create(Path(self.folder.name) / "results.sqlite")
         self.store.plan(self.jobs)
         self.holder: dict[str, Claim] = {}
