@@ -12,7 +12,7 @@ PACKAGES = ("lapgs_plugin", "lapgs_bench")
 
 @cache
 def said() -> tuple[tuple[str, str], ...]:
-    """Return the strings of the packages with their places; of its docstrings those of commands, which --help prints."""
+    """Return the strings of the packages with their places; of docstrings those of commands, which --help prints."""
     found = []
     for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
