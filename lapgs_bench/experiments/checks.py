@@ -70,15 +70,11 @@ def check_runs(
             _check_kinds(spec)
             if (job := by_id.get(spec.run_id)) is not None:
                 _rehearse(job, _Check(spec, sizes.get(spec.scene), here))
-        except MissingExtraError as error:
-            if here:
-                _note(mistakes, keys, str(error))
         except SceneError as error:
             mistakes.add(keys["scene"], str(error))
-        except LapgsError as error:
-            _note(mistakes, keys, str(error))
-        except USAGE_ERROR as error:
-            _note(mistakes, keys, usage_message(error))
+        except (LapgsError, USAGE_ERROR) as error:
+            if here or not isinstance(error, MissingExtraError):
+                _note(mistakes, keys, usage_message(error) if isinstance(error, USAGE_ERROR) else str(error))
 
 
 def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:

@@ -106,10 +106,10 @@ def _measure(cases: Sequence[BenchCase], repeats: int, dtype: torch.dtype) -> li
 def _print_results(results: Sequence[CaseResult]) -> None:
     from lapgs_bench.kernels.raster import FAST, machine
 
-    columns = ("size", "Gaussians", "blended\nper pixel", "contender", "ms", "times cpu", "required")
-    times = _titled_table("A training iteration, medians", (), columns)
-    columns = ("size", *(name.replace("_", "\n") for name in results[0].parts), "loss\nadds", "MB")
-    parts = _titled_table(f"Where the time of {FAST} goes, medians in ms", (), columns)
+    headings = "size", "Gaussians", "blended\nper pixel", "contender", "ms", "times cpu", "required"
+    times = _titled_table("A training iteration, medians", (), headings)
+    names = "size", *(name.replace("_", "\n") for name in results[0].parts), "loss\nadds", "MB"
+    parts = _titled_table(f"Where the time of {FAST} goes, medians in ms", (), names)
     for result in results:
         case = result.case
         for name, ms in result.milliseconds.items():

@@ -319,7 +319,7 @@ def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
 def _kernel_times() -> Iterator[dict[str, float]]:
     """Record the milliseconds of each parallel kernel of the fast rasterizer that runs inside, by name."""
     times: dict[str, float] = {}
-    run = pipeline.parallel
+    run = vars(pipeline)["parallel"]
 
     def timed(kernel: Callable[..., None], *arguments: Any) -> None:
         start = time.perf_counter()
