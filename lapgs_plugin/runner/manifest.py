@@ -93,7 +93,6 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
     before, now = _identity(found), _identity(wanted)
     for name in {**before, **now}:
         if before.get(name) != now.get(name):
-            # These defaults may have been others when the run was started.
             given = name in ("hierarchy", "split") and before.get(name)
             same = f"--{name} {before[name]}" if given else "the same options"
             raise RunFolderError(
@@ -138,4 +137,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim"):
         settings.pop(name, None)
-    return {**scene, **values, **settings, **backbone}
+    decisive = {
+        name: settings.get(name) for name in ("hierarchy", "protocol")
+    }  # first: other defaults follow from them
+    return {**decisive, **scene, **values, **settings, **backbone}

@@ -105,7 +105,10 @@ def test_settings_survive_the_manifest() -> None:
     saved = manifest.settings["densification"]
     for damaged, message in (
         ({"densification": {**saved, "strategy": []}}, r"densification.strategy is \[\], expected a valid string"),
-        ({"densification": {**saved, "options": {"cap_max": "many"}}}, "mcmc is damaged: cap_max is 'many', expected a valid"),
+        (
+            {"densification": {**saved, "options": {"cap_max": "many"}}},
+            "mcmc is damaged: cap_max is 'many', expected a valid",
+        ),
         ({"inherit_ratio": 0.5}, r"settings inherit_ratio do not match\); continue it with lapgs_plugin"),
     ):
         with pytest.raises(RunFolderError, match=message):
