@@ -28,7 +28,7 @@ from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.cli.usage import one_line_usage_errors
 from lapgs_plugin.cli.view import view
-from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.registry import Registry
 
 INSTALLED: Registry[typer.Typer] = Registry("lapgs", "lapgs.commands", typer.Typer, {})
@@ -45,12 +45,18 @@ class InstalledCommand(TyperCommand):
         """Import the command and return it as click's object.
 
         Raises:
-            UserInputError: it cannot be imported, or is no `typer.Typer`.
+            UserInputError: it cannot be imported, or is no `typer.Typer` with a command.
         """
         assert self.name is not None
         installed = INSTALLED[self.name]
         join_lines(installed)
-        command: Any = typer.main.get_command(installed)
+        try:
+            command: Any = typer.main.get_command(installed)
+        except (AssertionError, RuntimeError, TypeError) as error:  # typer's, such as of an app without commands
+            raise UserInputError(
+                f"lapgs {self.name}: {INSTALLED.entries[self.name].value} is no command ({typed_line(error)}); fix or "
+                "uninstall the package that brings it"
+            ) from error
         command.params = [one for one in command.params if one.name not in ("install_completion", "show_completion")]
         show_flags_without_type(command)
         return command

@@ -15,7 +15,8 @@ def join_lines(group: typer.Typer) -> None:
     """Join the lines of each paragraph of the help texts, which typer would print broken as they are in the source."""
     for command in [*group.registered_commands, group.registered_callback]:
         if command is not None and command.callback is not None:
-            paragraphs = inspect.cleandoc(command.callback.__doc__ or "").split("\n\n")
+            text = command.help if isinstance(command.help, str) else command.callback.__doc__
+            paragraphs = inspect.cleandoc(text or "").split("\n\n")
             command.help = "\n\n".join(text.replace("\n", " ") for text in paragraphs)
     for inner in group.registered_groups:
         if inner.typer_instance is not None:

@@ -20,6 +20,8 @@ greet = tiny_command:app
 train = tiny_command:app
 absent = tiny_command:ABSENT
 number = tiny_command:NUMBER
+empty = tiny_command:EMPTY
+told = tiny_command:TOLD
 gone = tiny_gone.app:app
 """
 SOURCE = '''\
@@ -34,6 +36,8 @@ def greet(name: str, loudly: bool = False) -> None:
     if not name.isalpha():
         raise UserInputError(f"NAME {name}: expected letters")
     print("HELLO" if loudly else "hello", name)
+EMPTY, TOLD = typer.Typer(), typer.Typer()
+TOLD.command(help="Told\\nhere.")(lambda: None)
 '''
 
 
@@ -64,6 +68,7 @@ def test_a_command_is_called_by_its_name() -> None:
     shown = lapgs("greet", "--help")
     assert "Say hello, and no more." in shown, "paragraphs flow"
     assert "completion" not in shown
+    assert "Told here." in lapgs("told", "--help")
     with pytest.raises(UserInputError, match="NAME 1: expected letters"):
         lapgs("greet", "1")
     with pytest.raises(UserInputError, match="no such option: --loud"):
@@ -80,6 +85,7 @@ def test_names_of_this_package_cannot_be_taken() -> None:
     [
         ("absent", "tiny_command:ABSENT cannot be loaded: AttributeError"),
         ("number", "tiny_command:NUMBER is a int, expected an instance of Typer"),
+        ("empty", "tiny_command:EMPTY is no command (RuntimeError: Could not get a command"),
         ("gone", "tiny_gone.app:app cannot be loaded: ModuleNotFoundError"),
         ("gret", "no such command 'gret'. Did you mean 'greet'"),
     ],
