@@ -51,7 +51,7 @@ check: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	$(BIN)/python -m compileall -q -j 0 -x '$(UNUSED)' $(VENV)/lib lapgs_plugin >/dev/null || true
+	$(BIN)/python -m compileall -q -j 0 -x '$(UNUSED)' $(VENV)/lib lapgs_plugin lapgs_bench >/dev/null || true
 	touch $@
 
 clean:

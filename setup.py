@@ -14,7 +14,7 @@ class PagesOfDocs(build_py):
 
 
 setup(
-    packages=[*find_packages(include=["lapgs_plugin*"]), DOCS, "lapgs_plugin.patches"],
+    packages=[*find_packages(include=["lapgs_plugin*", "lapgs_bench*"]), DOCS, "lapgs_plugin.patches"],
     package_dir={DOCS: "docs", "lapgs_plugin.patches": "patches"},
     cmdclass={"build_py": PagesOfDocs},
 )

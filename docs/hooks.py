@@ -80,7 +80,7 @@ def _resolved(document: str, target: str) -> str:
 
 def command_reference() -> str:
     """Return a page with every command and option, from the code that parses them."""
-    from lapgs_plugin.cli.app import app
+    from lapgs_plugin.cli.app import all_commands
 
     lines = [
         "# Commands",
@@ -88,7 +88,7 @@ def command_reference() -> str:
         "Every command with its options and defaults, as `lapgs COMMAND --help` prints them. This page is generated "
         "from the code.",
     ]
-    for words, command in commands(typer.main.get_command(app), ("lapgs",)):
+    for words, command in commands(all_commands(), ("lapgs",)):
         lines += ["", *_command_section(words, command)]
     return "\n".join(lines) + "\n"
 

@@ -67,14 +67,14 @@ class Registry(Generic[T]):
         self._own = dict(own)
 
     @cached_property
-    def _found(self) -> Mapping[str, EntryPoint]:
+    def entries(self) -> Mapping[str, EntryPoint]:
         """Entry points of other packages by name."""
         entries = chosen_entries(self._option, self.group, ALL)
         return {entry.name: entry for entry in entries if entry.name not in self._own}
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over all names, this package's first."""
-        return iter((*self._own, *self._found))
+        return iter((*self._own, *self.entries))
 
     def __getitem__(self, name: str) -> T:
         """Return the implementation called `name`.
@@ -85,11 +85,11 @@ class Registry(Generic[T]):
         if name in self._own:
             own = self._own[name]
             return self._loaded(name, own, lambda: resolve_name(own)) if isinstance(own, str) else own
-        if name not in self._found:
+        if name not in self.entries:
             known = list(self)
             expected = " or ".join(known) if len(known) == 2 else ", ".join(known)
             raise UserInputError(f"{self._option} {name}: expected {expected}")
-        return self._loaded(name, self._found[name].value, self._found[name].load)
+        return self._loaded(name, self.entries[name].value, self.entries[name].load)
 
     def _loaded(self, name: str, source: str, load: Callable[[], Any]) -> T:
         label, advice = f"{self._option} {name}: {source}", "fix or uninstall the package that brings it"

@@ -1,4 +1,4 @@
-"""Find the strings in the sources of the package: what it may say."""
+"""Find the strings in the sources of the packages: what they may say."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = ("lapgs_plugin", "lapgs_bench")
 
 
 @cache
 def said() -> tuple[tuple[str, str], ...]:
-    """Return the strings of the package with their places; of its docstrings those of commands, which --help prints."""
+    """Return the strings of the packages with their places; of docstrings those of commands, which --help prints."""
     found = []
-    for path in sorted((ROOT / "lapgs_plugin").rglob("*.py")):
+    for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        functions = [node for node in nodes if isinstance(node, ast.FunctionDef) and path.parent.name == "cli"]
+        of_commands = path.parent.name == "cli" or path.name in ("app.py", "commands.py")
+        functions = [node for node in nodes if isinstance(node, ast.FunctionDef) and of_commands]
         printed = {id(function.body[0]) for function in functions}
         silent = {id(node.value) for node in nodes if isinstance(node, ast.Expr) and id(node) not in printed}
         found += [

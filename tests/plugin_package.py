@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from lapgs_plugin.adapters.registry import BACKBONES
+from lapgs_plugin.cli.app import INSTALLED
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
+from lapgs_plugin.registry import Registry
+from lapgs_plugin.reports.folders import FOLDER_REPORTS
+from lapgs_plugin.training.strategies import STRATEGIES
+
+REGISTRIES: tuple[Registry[Any], ...] = (BACKBONES, SUPERVISIONS, RASTERIZERS, STRATEGIES, FOLDER_REPORTS, INSTALLED)
+"""All that other packages can add to, but hooks."""
 
 
 def install_package(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, entry_points: str, source: str) -> None:
@@ -25,6 +33,6 @@ def install_package(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, en
     (info / "entry_points.txt").write_text(entry_points)
     (folder / f"{name}.py").write_text(source)
     monkeypatch.syspath_prepend(folder)
-    for registry in (BACKBONES, SUPERVISIONS, RASTERIZERS):  # each remembers the entry points that it has found
-        monkeypatch.delitem(vars(registry), "_found", raising=False)
-        monkeypatch.setitem(vars(registry), "_found", type(registry)._found.func(registry))
+    for registry in REGISTRIES:  # each remembers the entry points that it has found
+        monkeypatch.delitem(vars(registry), "entries", raising=False)
+        monkeypatch.setitem(vars(registry), "entries", type(registry).entries.func(registry))

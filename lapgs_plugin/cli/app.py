@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 import traceback
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from lapgs_plugin import __version__, interrupt
 from lapgs_plugin.cli import patch
-from lapgs_plugin.cli.bench import bench_app
 from lapgs_plugin.cli.config_file import naming_the_config
 from lapgs_plugin.cli.conformance import conformance
 from lapgs_plugin.cli.doctor import doctor
 from lapgs_plugin.cli.evaluate import evaluate
 from lapgs_plugin.cli.export import export
 from lapgs_plugin.cli.help import show_topic
+from lapgs_plugin.cli.help_texts import join_lines, module_summary, show_flags_without_type
 from lapgs_plugin.cli.import_run import import_run
 from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.cli.render import render
@@ -29,7 +28,41 @@ from lapgs_plugin.cli.sample import sample
 from lapgs_plugin.cli.train import train
 from lapgs_plugin.cli.usage import one_line_usage_errors
 from lapgs_plugin.cli.view import view
-from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
+from lapgs_plugin.registry import Registry
+
+INSTALLED: Registry[typer.Typer] = Registry("lapgs", "lapgs.commands", typer.Typer, {})
+"""Commands of entry points, such as `lapgs bench`; those of this file come first."""
+
+
+class InstalledCommand(TyperCommand):
+    """A command of an entry point. Its package is imported when it is called; `lapgs --help` reads its source."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, help=module_summary(INSTALLED.entries[name].module))
+
+    def load(self) -> Any:
+        """Import the command and return it as click's object.
+
+        Raises:
+            UserInputError: it cannot be imported, or is no `typer.Typer` with a command.
+        """
+        assert self.name is not None
+        installed = INSTALLED[self.name]
+        join_lines(installed)
+        try:
+            command: Any = typer.main.get_command(installed)
+        except (AssertionError, RuntimeError, TypeError) as error:  # typer's, such as of an app without commands
+            raise UserInputError(
+                f"lapgs {self.name}: {INSTALLED.entries[self.name].value} is no command ({typed_line(error)}); fix or "
+                "uninstall the package that brings it"
+            ) from error
+        command.params = [one for one in command.params if one.name not in ("install_completion", "show_completion")]
+        show_flags_without_type(command)
+        return command
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        return self.load().make_context(*args, **kwargs)
 
 
 class Commands(TyperGroup):
@@ -37,7 +70,18 @@ class Commands(TyperGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        _show_flags_without_type(self)
+        show_flags_without_type(self)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        for name in INSTALLED:
+            if name not in self.commands:
+                self.commands[name] = InstalledCommand(name)
+        return super().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in self.commands:  # looking for entry points takes time
+            self.list_commands(ctx)
+        return super().get_command(ctx, cmd_name)
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         with one_line_usage_errors():
@@ -46,15 +90,6 @@ class Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with interrupt.command(), naming_the_config(ctx.meta), one_line_usage_errors(ctx):
             return super().invoke(ctx)
-
-
-def _show_flags_without_type(command: Any) -> None:
-    """Leave out `<bool>` behind flags in help texts: it reads as if a value had to follow."""
-    for each in command.get_params(typer.Context(command)):
-        if getattr(each, "is_flag", False):
-            each.metavar = ""
-    for below in getattr(command, "commands", {}).values():
-        _show_flags_without_type(below)
 
 
 app = typer.Typer(
@@ -92,25 +127,23 @@ app.command("report")(report)
 app.command("view")(view)
 app.command("export")(export)
 app.command("import-run")(import_run)
-app.add_typer(bench_app, name="bench")
 app.command("conformance")(conformance)
 app.add_typer(patch.app, name="patch")
 app.command("doctor")(doctor)
 app.command("help")(show_topic)
 
 
-def _flowing_help(group: typer.Typer) -> None:
-    """Join the lines of each paragraph of the help texts, which typer would print broken as they are in the source."""
-    for each in [*group.registered_commands, group.registered_callback]:
-        if each is not None and each.callback is not None:
-            paragraphs = inspect.cleandoc(each.callback.__doc__ or "").split("\n\n")
-            each.help = "\n\n".join(text.replace("\n", " ") for text in paragraphs)
-    for inner in group.registered_groups:
-        if inner.typer_instance is not None:
-            _flowing_help(inner.typer_instance)
+join_lines(app)
 
 
-_flowing_help(app)
+def all_commands() -> Any:
+    """Return all commands as click's objects, with those of entry points imported."""
+    group = typer.main.get_command(app)
+    commands: dict[str, Any] = vars(group)["commands"]
+    for name in group.list_commands(typer.Context(group)):  # type: ignore[attr-defined]  # it is a group
+        if isinstance(commands[name], InstalledCommand):
+            commands[name] = commands[name].load()
+    return group
 
 
 def run() -> None:

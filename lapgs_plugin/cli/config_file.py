@@ -15,9 +15,7 @@ import typer
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError, nearest
 from lapgs_plugin.files import write_text
-from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.runs.layout import RUN_CONFIG
-from lapgs_plugin.training.strategies import GRADIENTS, MCMC
 from lapgs_plugin.untrusted import read_text, read_toml
 
 if TYPE_CHECKING:
@@ -98,21 +96,11 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
         if isinstance(value, bool) and not getattr(known[option], "is_flag", False):  # Python takes it for a number
             raise UserInputError(f"{path}: {key} is {json.dumps(value)}, expected a value of --{option}")
         values[name] = value
-    return _of_this_version(values)
-
-
-def _of_this_version(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of a file that may be of an older version, which wrote defaults that have changed since."""
-    strategy = values.get("strategy")
-    if strategy == "default":  # its name once
-        values["strategy"] = GRADIENTS
-    if strategy not in (None, AUTO, MCMC) and values.get("cap_max") == 1_000_000:  # written with every strategy
-        del values["cap_max"]
     return values
 
 
 def extended_config(path: Path, settings: TrainSettings) -> str | None:
-    """Return a run's settings file with what the extension of the run changes; None if the run, an older one, has none.
+    """Return a run's settings file with what the extension of the run changes; None if the run has none.
 
     Args:
         path: of the file.

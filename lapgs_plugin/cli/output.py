@@ -38,11 +38,11 @@ def say(text: str, *, stderr: bool = False) -> None:
 
 
 class _EscapingFormatter(logging.Formatter):
-    """Show control characters of names as escapes in messages of this package."""
+    """Show control characters of names as escapes in messages of this program."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)
-        return printable_lines(text) if record.name.startswith("lapgs_plugin") else text
+        return printable_lines(text) if record.name.startswith("lapgs_") else text
 
 
 def log_to_stderr(pattern: str = "lapgs: %(message)s") -> None:

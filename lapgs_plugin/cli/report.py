@@ -41,22 +41,20 @@ def report(
     and the scenes whose runs still exist.
     """
     from lapgs_plugin.evaluation.figures import run_metrics
-    from lapgs_plugin.experiments.exports import CSV
+    from lapgs_plugin.reports.folders import FOLDER_REPORTS
     from lapgs_plugin.reports.report import MeasuredRun, write_report
     from lapgs_plugin.runs.archive import RunArchive
 
     run = run or _newest(Path("runs"))
-    if (run / CSV).is_file():
-        if baseline or options.scene:
-            raise UserInputError(
-                f"{run} is an experiment with baselines and scenes of its own; leave out --baseline and --scene"
-            )
-        from lapgs_plugin.experiments.report import write_experiment_report
-
-        show_log()
-        page = write_experiment_report(run, options)
-        say(f"{page} shows the experiment")
-        return
+    for name in FOLDER_REPORTS:
+        if (run / FOLDER_REPORTS[name].marker).is_file():
+            if baseline or options.scene:
+                raise UserInputError(
+                    f"{run} ({name}) has baselines and scenes of its own; leave out --baseline and --scene"
+                )
+            show_log()
+            say(f"{FOLDER_REPORTS[name]().write(run, options)} shows the {name}")
+            return
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
     show_log()
     runs = [MeasuredRun(archive, run_metrics(archive, options)) for archive in archives]
@@ -66,22 +64,22 @@ def report(
 
 
 def _newest(folder: Path) -> Path:
-    """Return the run or experiment in a folder that was written to last.
+    """Return the run, or other folder with a report, in a folder that was written to last.
 
     Raises:
         RunFolderError: there is none.
     """
-    from lapgs_plugin.experiments.exports import CSV
     from lapgs_plugin.files import MANIFEST
+    from lapgs_plugin.reports.folders import FOLDER_REPORTS
 
-    patterns = [f"*/{MANIFEST}", f"*/*/{MANIFEST}", f"*/{CSV}", f"*/*/{CSV}"]
-    found = [path for pattern in patterns for path in folder.glob(pattern)]
-    if not found:
+    markers = MANIFEST, *(FOLDER_REPORTS[name].marker for name in FOLDER_REPORTS)
+    files = [path for marker in markers for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{marker}")]
+    if not files:
         raise RunFolderError(
-            f"{folder.absolute()} holds no run and no experiment; name one, or train one with "
+            f"{folder.absolute()} holds no {' and no '.join(('run', *FOLDER_REPORTS))}; name one, or train one with "
             "`lapgs train SCENE -o runs/NAME`"
         )
-    return max(found, key=lambda path: path.stat().st_mtime).parent
+    return max(files, key=lambda path: path.stat().st_mtime).parent
 
 
 def _print(runs: Sequence[MeasuredRun]) -> None:

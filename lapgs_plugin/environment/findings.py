@@ -170,25 +170,28 @@ def extra_findings(requirements: Mapping[str, Sequence[Requirement]]) -> list[Fi
 
 ENTRY_POINT_GROUPS = {
     f"{PACKAGE}.hooks": "a hook, part of every run",
-    f"{PACKAGE}.supervisions": "--supervision",
-    f"{PACKAGE}.backbones": "--backbone",
-    f"{PACKAGE}.strategies": "--strategy",
-    f"{PACKAGE}.rasterizers": "--rasterizer",
+    f"{PACKAGE}.supervisions": "--supervision {}",
+    f"{PACKAGE}.backbones": "--backbone {}",
+    f"{PACKAGE}.strategies": "--strategy {}",
+    f"{PACKAGE}.rasterizers": "--rasterizer {}",
+    f"{PACKAGE}.reports": "lapgs report, of folders of kind {}",
+    "lapgs.commands": "lapgs {}",
 }
 """Groups of entry points through which other packages extend this one, and what each adds."""
 
 
 def entry_point_findings() -> list[Finding]:
-    """Return what installed packages add through entry points, without importing it; misspelt groups are problems."""
+    """Return what other packages add through entry points, without importing it; misspelt groups are problems."""
     found = {}
     for distribution in metadata.distributions():
         for entry in distribution.entry_points:
             source = f"{entry.value} of {distribution.name} {distribution.version}"
+            if distribution.name == PACKAGE:
+                continue
             if entry.group in ENTRY_POINT_GROUPS:
-                kind = ENTRY_POINT_GROUPS[entry.group]
-                use = f"{kind} {entry.name}" if kind.startswith("--") else kind
+                use = ENTRY_POINT_GROUPS[entry.group].format(entry.name)
                 found[entry.group, entry.name] = Finding(entry.name, "ok", f"{use}: {source}")
-            elif entry.group.startswith(f"{PACKAGE}."):
+            elif entry.group.startswith((f"{PACKAGE}.", "lapgs.")):
                 detail = f"{source} is in the group {entry.group}, which nothing reads"
                 advice = f"name one of {', '.join(ENTRY_POINT_GROUPS)} in its pyproject.toml"
                 found[entry.group, entry.name] = Finding(entry.name, "problem", detail, advice)

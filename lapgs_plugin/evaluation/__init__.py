@@ -1,1 +1,1 @@
-"""Measure runs and their flicker, check rasterizers, and time them."""
+"""Measure runs and their flicker, and check rasterizers."""

@@ -41,7 +41,7 @@ from lapgs_plugin.runs.results import MEASURED
 from lapgs_plugin.runs.training_figures import weak_levels
 from lapgs_plugin.untrusted import shortened
 
-TEMPLATE = "report.html.jinja"
+TEMPLATE = Path(__file__).with_name("report.html.jinja")
 MINUTES_FROM = 300.0
 """Least length of a run, in seconds, whose charts show minutes."""
 START_SHARE = 0.15
@@ -118,16 +118,16 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
     return path
 
 
-def render_page(template: str, **values: Any) -> str:
-    """Render a template of this folder."""
+def render_page(template: Path, **values: Any) -> str:
+    """Render a template, which may import others of its folder and of this one."""
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader([template.parent, Path(__file__).parent]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(values, inset_at=INSET_AT)
+    return environment.get_template(template.name).render(values, inset_at=INSET_AT)
 
 
 # Charts of training.

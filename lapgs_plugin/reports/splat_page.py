@@ -19,7 +19,7 @@ from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.rendering.rig import Rig, forward
 from lapgs_plugin.reports.report import render_page
 
-TEMPLATE = "splats.html.jinja"
+TEMPLATE = Path(__file__).with_name("splats.html.jinja")
 NEAREST_TARGET = 0.05
 """Least distance of the point that the view turns around, in distances of the cameras from their focus."""
 

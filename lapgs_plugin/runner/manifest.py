@@ -12,7 +12,7 @@ from typing import Any
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.hierarchy.plan import Hierarchy, StagePlan
+from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
@@ -93,7 +93,6 @@ def require_same_run(found: Manifest, wanted: Manifest) -> None:
     before, now = _identity(found), _identity(wanted)
     for name in {**before, **now}:
         if before.get(name) != now.get(name):
-            # These defaults may have been others when the run was started.
             given = name in ("hierarchy", "split") and before.get(name)
             same = f"--{name} {before[name]}" if given else "the same options"
             raise RunFolderError(
@@ -138,16 +137,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
     for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim"):
         settings.pop(name, None)
-    # Manifests of earlier versions lack these.
-    residuals = Hierarchy.LAPLACIAN.value
-    before = {
-        "hierarchy": residuals,
-        "protocol": "default",
-        "prune": 0.0,
-        "hooks": "all",
-        "residual_threshold": 1.0,
-        "residual_resets": settings.get("hierarchy", residuals) == residuals,
-        "sh_rate": 1.0,
-        "prune_by_size": True,
-    }
-    return {**before, **scene, **values, **settings, **backbone}
+    decisive = {
+        name: settings.get(name) for name in ("hierarchy", "protocol")
+    }  # first: other defaults follow from them
+    return {**decisive, **scene, **values, **settings, **backbone}

@@ -17,7 +17,6 @@ from lapgs_plugin.runs.layout import (
     EXPOSURE,
     EXTENDED,
     METRICS,
-    ONCE,
     OPTIMIZER,
     PLY,
     POSES,
@@ -325,10 +324,7 @@ class RunArchive(RunFiles):
 
     def _learned(self, level: int, name: str, kind: Any) -> Any:
         """Read what a level learned of the training photos; None if it has no such file."""
-        places = [self._extended_path(level, name), self.path(f"level_{level}", name)]
-        if "exposure" in self._manifest.settings:  # not a checkout's run, whose files of these names are its own
-            places.append(self.path(f"level_{level}", ONCE[name]))
-        path = next(filter(exists, places), None)
+        path = next(filter(exists, (self._extended_path(level, name), self.path(f"level_{level}", name))), None)
         if path is None:
             return None
         return read_json(path, kind, error=RunFolderError, advice="train again with --overwrite")

@@ -49,8 +49,6 @@ RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
 """Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning."""
-ONCE = {EXPOSURE: "exposure.json", POSES: "poses.json"}
-"""Their names in older runs of `lapgs train`."""
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 FORGET_EXTENSION = "delete it to extend the run anew"

@@ -56,7 +56,6 @@ class ModelState(_State):
 
     params: dict[str, Tensor]
     moments: Moments
-    gradients: NotRequired[dict[str, Tensor]]  # empty, of earlier versions
     signed: bool
 
 

@@ -7,7 +7,7 @@ import importlib.util
 import pytest
 import torch
 
-from lapgs_plugin.cli.bench import bench_app
+from lapgs_bench.app import app
 from lapgs_plugin.errors import UserInputError
 from tests.cli.commands import succeeding
 
@@ -22,19 +22,19 @@ from tests.cli.commands import succeeding
 )
 def test_bad_options_are_one_line(options: tuple[str, ...], message: str) -> None:
     with pytest.raises(UserInputError, match=message):
-        succeeding(bench_app, 120)("blend", *options)
+        succeeding(app, 120)("blend", *options)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
 def test_it_needs_a_gpu() -> None:
     with pytest.raises(UserInputError, match="PyTorch finds no CUDA device"):
-        succeeding(bench_app, 120)("blend")
+        succeeding(app, 120)("blend")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 @pytest.mark.parametrize("shapes", ["1", "8x3", "8x4", "32", "axa", "²x2", "8x1x2"])
 def test_shapes_that_our_kernels_lack_are_refused(shapes: str) -> None:
-    from lapgs_plugin.evaluation.bench_blend import parse_shapes
+    from lapgs_bench.kernels.blend import parse_shapes
 
     with pytest.raises(UserInputError, match=f"--shapes '{shapes}': expected"):
         parse_shapes(shapes)
@@ -42,7 +42,7 @@ def test_shapes_that_our_kernels_lack_are_refused(shapes: str) -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 def test_shapes() -> None:
-    from lapgs_plugin.evaluation.bench_blend import parse_shapes
+    from lapgs_bench.kernels.blend import parse_shapes
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import SHAPE, Shape
 
     assert list(parse_shapes("8, 4x1").values()) == [Shape(8), Shape(4, 1)]

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli import bench_check, bench_experiment
+from lapgs_bench.experiments import checks, run
+from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.schema import load_experiment
+from lapgs_bench.experiments.standard import EXPERIMENTS
 from lapgs_plugin.cli.app import app
-from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.schema import load_experiment
-from lapgs_plugin.experiments.standard import EXPERIMENTS
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import CHECKOUTS
 
@@ -76,8 +76,8 @@ def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object) -> None:
         raise AssertionError("something was started or written")
 
-    monkeypatch.setattr(bench_experiment, "launch", started)
-    monkeypatch.setattr(bench_experiment, "make_samples", started)
+    monkeypatch.setattr(run, "launch", started)
+    monkeypatch.setattr(run, "make_samples", started)
 
 
 def lines_about(text: str, *words: str) -> list[str]:
@@ -266,13 +266,13 @@ def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.Monkey
 def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every run is rehearsed."""
     checked = []
-    real = bench_check._rehearse
+    real = checks._rehearse
 
     def noting(job: object, check: object) -> None:
         checked.append(job)
         real(job, check)  # type: ignore[arg-type]  # passed through
 
-    monkeypatch.setattr(bench_check, "_rehearse", noting)
+    monkeypatch.setattr(checks, "_rehearse", noting)
     Path("tiny.toml").write_text(GOOD)
     words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
     printed = CliRunner().invoke(app, words).stdout
@@ -283,7 +283,7 @@ def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytes
 def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
-    monkeypatch.setattr(bench_check, "_smallest_size", lambda scene, folder, resolution: (1600, 1066))
+    monkeypatch.setattr(checks, "_smallest_size", lambda scene, folder, resolution: (1600, 1066))
     for shipped, path in EXPERIMENTS.items():
         experiment = load_experiment(path, _option_names())
         names = {name for entry in experiment.scenes for name in entry.names}

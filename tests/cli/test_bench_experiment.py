@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli.bench import bench_app
-from lapgs_plugin.cli.bench_experiment import _option_names
+from lapgs_bench.app import app
+from lapgs_bench.experiments.expansion import plan_runs
+from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.schema import load_experiment
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.store import DONE, FAILED, Job, ResultStore
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.experiments.expansion import plan_runs
-from lapgs_plugin.experiments.schema import load_experiment
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.store import DONE, FAILED, Job, ResultStore
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.waiting import wait_for
 
@@ -126,7 +126,7 @@ def test_killed_in_the_middle_two_others_go_on_and_share_the_work(experiment: Pa
 
 
 def invoke(*words: str | Path) -> BaseException | None:
-    return CliRunner().invoke(bench_app, [str(word) for word in words]).exception
+    return CliRunner().invoke(app, [str(word) for word in words]).exception
 
 
 def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path) -> None:
@@ -143,18 +143,18 @@ def test_results_of_another_version_are_named(experiment: Path) -> None:
     out = experiment.parent / "out"
     planned = plan_runs(load_experiment(experiment, _option_names()), Selection())
     store = ResultStore.create(out / "results.sqlite")
-    store.plan([Job(run.spec.run_id, run.spec, "", "", (), True) for run in planned])
+    store.plan([Job(run.spec.run_id, run.spec, "", "", (), True, "{}") for run in planned])
     claim = store.claim([planned[0].spec.run_id])
     assert claim is not None
     store.record(claim, {"psnr": 20.0, "train_seconds": 1.0, "lapgs_version": "0.0.9"})
     words = [str(experiment), "--out", str(out), "--tables-only"]
-    result = CliRunner().invoke(bench_app, words)
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 0
     assert "some results were made by lapgs_plugin 0.0.9" in result.stderr
     assert "lapgs_plugin 0.0.9" in (out / "tables.md").read_text()
     assert "| one field |" in result.stdout, "a pipe gets the Markdown"
     assert result.stdout.rstrip().endswith(f"lapgs report {out} writes a page with curves and images")
-    shown = CliRunner().invoke(bench_app, words, env={"FORCE_COLOR": "1", "COLUMNS": "150"}).stdout
+    shown = CliRunner().invoke(app, words, env={"FORCE_COLOR": "1", "COLUMNS": "150"}).stdout
     assert "one field" in shown
     assert "20.00" in shown
     assert "|" not in shown, "a terminal gets tables, not their source"
@@ -167,7 +167,7 @@ def test_tables_of_nothing(experiment: Path) -> None:
 
 
 def test_a_dry_run_prints_commands_and_writes_nothing(experiment: Path) -> None:
-    result = CliRunner().invoke(bench_app, [str(experiment), "--dry-run", "--out", str(experiment.parent / "out")])
+    result = CliRunner().invoke(app, [str(experiment), "--dry-run", "--out", str(experiment.parent / "out")])
     assert result.exit_code == 0
     assert "lapgs_plugin train" in result.output
     assert "lapgs_plugin eval" in result.output
@@ -175,6 +175,6 @@ def test_a_dry_run_prints_commands_and_writes_nothing(experiment: Path) -> None:
 
 
 def test_subcommands_are_still_found() -> None:
-    help_of_raster = CliRunner().invoke(bench_app, ["raster", "--help"]).output
+    help_of_raster = CliRunner().invoke(app, ["raster", "--help"]).output
     assert "Measure training iterations of the CPU rasterizer" in help_of_raster
-    assert "EXPERIMENT" in CliRunner().invoke(bench_app, ["--help"]).output
+    assert "EXPERIMENT" in CliRunner().invoke(app, ["--help"]).output

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lapgs_plugin.cli.bench import bench_app
+from lapgs_bench.app import app
+from lapgs_bench.kernels.operations import TORCH, benchmark
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.ops.benchmark import TORCH, benchmark
 from tests.cli.commands import succeeding
 
 SMALL = ("--device", "cpu", "--width", 36, "--height", 24, "--gaussians", 50, "--repeats", 1)
@@ -34,7 +34,7 @@ def test_sides_that_kornia_cannot_double_leave_it_out() -> None:
 
 
 def test_table() -> None:
-    table = succeeding(bench_app, 120)("ops", *SMALL)
+    table = succeeding(app, 120)("ops", *SMALL)
     assert "Operations at 36x24 with 50 Gaussians on cpu" in table
     for word in ("upsample", "densification statistics", "Numba", "kornia.pyrup", "speed-up"):
         assert word in table
@@ -42,4 +42,4 @@ def test_table() -> None:
 
 def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(UserInputError, match="--device tpu: expected auto, cuda, cpu"):
-        succeeding(bench_app, 120)("ops", "--device", "tpu")
+        succeeding(app, 120)("ops", "--device", "tpu")

@@ -12,16 +12,12 @@ import typer
 from typer.testing import CliRunner
 
 from lapgs_plugin import environment
-from lapgs_plugin.adapters.registry import BACKBONES
 from lapgs_plugin.cli.doctor import current_folder, doctor, examine
 from lapgs_plugin.environment import findings, probes
 from lapgs_plugin.environment.probes import Probe
-from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.registry import HOOKS
-from lapgs_plugin.training.strategies import STRATEGIES
 from tests.contract.stub_runs import CHECKOUTS
-from tests.plugin_package import install_package
+from tests.plugin_package import REGISTRIES, install_package
 
 probed = lru_cache(probes.run_probe)
 """Run each probe once for all tests: it is a process that imports PyTorch."""
@@ -56,14 +52,16 @@ def test_entry_points_of_packages_are_listed_and_misspelt_groups_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entries = "[lapgs_plugin.hooks]\nsmooth = tiny:Smooth\n[lapgs_plugin.rasterizers]\ndiscs = tiny:Discs\n"
+    entries += "[lapgs.commands]\nhello = tiny:app\n"
     install_package(tmp_path, monkeypatch, "tiny", f"{entries}[lapgs_plugin.strategy]\nopaque = tiny:OPAQUE\n", "")
     found = {finding.name: finding for finding in findings.entry_point_findings()}
     assert found["smooth"].detail == "a hook, part of every run: tiny:Smooth of tiny 1.0"
     assert found["discs"].detail == "--rasterizer discs: tiny:Discs of tiny 1.0"
     assert found["opaque"].status == "problem"
     assert "lapgs_plugin.strategy, which nothing reads" in found["opaque"].detail
-    registries = (SUPERVISIONS, BACKBONES, STRATEGIES, RASTERIZERS)
-    assert {*(each.group for each in registries), HOOKS} == set(findings.ENTRY_POINT_GROUPS)
+    assert found["hello"].detail == "lapgs hello: tiny:app of tiny 1.0"
+    assert "bench" not in found, "it is of this package"
+    assert {*(registry.group for registry in REGISTRIES), HOOKS} == set(findings.ENTRY_POINT_GROUPS)
 
 
 def test_a_broken_machine_gets_advice_and_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:

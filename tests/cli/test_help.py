@@ -10,10 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.app import all_commands, app
 
 HEAVY = ("torch", "numba", "numpy", "pycolmap", "OpenImageIO", "gsplat", "cv2", "viser")
 
@@ -27,7 +26,7 @@ def _commands() -> list[list[str]]:
             found.append([*words, name])
             visit(each, [*words, name])
 
-    visit(typer.main.get_command(app), [])
+    visit(all_commands(), [])
     return found
 
 
@@ -36,7 +35,7 @@ COMMANDS = _commands()
 SCRIPT = """
 import json, sys
 from typer.testing import CliRunner
-from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.app import all_commands, app
 codes = [CliRunner().invoke(app, [*words, "--help"]).exit_code for words in json.loads(sys.argv[1])]
 print(json.dumps({"codes": codes, "modules": sorted(sys.modules)}))
 """
@@ -53,7 +52,7 @@ def test_help_of_all_commands_imports_nothing_heavy() -> None:
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_first_line_is_a_sentence_and_every_option_is_described(words: list[str]) -> None:
-    command: Any = typer.main.get_command(app)
+    command: Any = all_commands()
     for word in words:
         command = command.commands[word]
     first = command.help.split("\n\n")[0].replace("\n", " ")
@@ -79,7 +78,7 @@ def test_paragraphs_fill_the_lines_of_a_terminal_and_examples_take_one_each(word
 
 
 def test_options_that_train_and_run_share_come_in_the_same_order() -> None:
-    commands: Any = typer.main.get_command(app)
+    commands = all_commands()
     train, run = ([option.name for option in commands.commands[name].params] for name in ("train", "run"))
     shared = [name for name in train if name in run]
     assert "resume" in shared

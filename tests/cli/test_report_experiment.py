@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from lapgs_bench.experiments.exports import write_csv
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.figures import evaluate_run
-from lapgs_plugin.experiments.exports import write_csv
 from lapgs_plugin.files import write_text
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene
@@ -170,7 +170,7 @@ def test_the_newest_run_or_experiment_is_reported_on(
 
 
 def test_mistakes(experiment: Path) -> None:
-    with pytest.raises(UserInputError, match="is an experiment with baselines and scenes of its own"):
+    with pytest.raises(UserInputError, match="has baselines and scenes of its own; leave out --baseline"):
         lapgs_report(experiment, "--baseline", experiment / "runs" / "0-cpu-1-0")
     (experiment / "results.csv").write_text("name,value\na,1\n")
     with pytest.raises(

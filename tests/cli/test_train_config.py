@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.training import tensorboard
-from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import read_json_lines, read_toml
 from tests.cli.commands import succeeding
 
@@ -119,24 +117,6 @@ def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path
     ):
         with pytest.raises(UserInputError, match=message):
             lapgs("train", scene, "-o", run, "--resume", *asked)
-
-
-def test_files_of_older_versions_name_strategies_as_they_are_now(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, density = tmp_path / "run.toml", []
-
-    def create(out: Path, reference: object, settings: TrainSettings, *rest: object) -> None:
-        density.append(settings.densification)
-        raise UserInputError("far enough")
-
-    monkeypatch.setattr(sys.modules["lapgs_plugin.cli.train"], "_create", create)
-    for old in ("default", "multiview", "mcmc"):
-        config.write_text(f'strategy = "{old}"\ncap-max = 1000000\niterations = 8000\n')
-        with pytest.raises(UserInputError, match="far enough"):
-            lapgs("train", scene, "--config", config, "-o", tmp_path / "run")
-    assert [each.strategy for each in density] == ["3dgs", "multiview", "mcmc"]
-    assert [getattr(each.options, "cap_max", None) for each in density] == [None, None, 1_000_000]
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
+from lapgs_bench.experiments.standard import PRESETS
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.standard import PRESETS
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.training.schedule import StageSchedule

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import signal
@@ -103,26 +102,6 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     assert plys(archive) == plys(whole)
     places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
-
-
-@pytest.mark.slow
-def test_an_older_run_with_residuals_still_resets_opacities_in_them(scene: Scene, tmp_path: Path) -> None:
-    """Manifests of that time have no `residual_resets`, and the options of all strategies beside the rest."""
-    density = Densification(until=420, every=20)
-    settings = replace(SETTINGS, iterations=480, split="1/4,3/4", densification=density, residual_resets=True)
-    whole = train(tmp_path / "whole", scene, settings)
-    run = tmp_path / "older"
-    with pytest.raises(TrainingStoppedError):
-        train(run, scene, settings, monitor=StopAt(0, 200))
-    manifest = json.loads((run / "manifest.json").read_text())
-    assert manifest["settings"].pop("residual_resets")
-    flat = manifest["settings"]["densification"]
-    flat |= flat.pop("options") | {"cap_max": 1_000_000, "base_cap_max": None, "error_pixels": 0.1}
-    (run / "manifest.json").write_text(json.dumps(manifest))
-    older = settings_from_manifest(RunArchive.open(run).manifest)
-    assert plys(resume(run, scene, older)) == plys(whole)
-    without = train(tmp_path / "without", scene, replace(settings, residual_resets=False))
-    assert plys(without) != plys(whole), "the reset after 300 of the residual's 360 iterations makes a difference"
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from lapgs_plugin import limits
-from lapgs_plugin.cli.app import app
+from lapgs_plugin.cli.app import all_commands
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.untrusted import JSON_MIB, JSON_MIB_VARIABLE
 from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, prose
@@ -45,7 +44,7 @@ OF_OTHERS = {
 
 def parsed(words: list[str]) -> tuple[Any, Any]:
     """Parse a command line as the program does, and return the command and its context."""
-    command, name = typer.main.get_command(app), "lapgs"
+    command, name = all_commands(), "lapgs"
     parent: Any = None
     while True:
         context = command.make_context(name, list(words), parent=parent, obj=Rehearsal())
@@ -83,7 +82,7 @@ def test_a_renamed_option_would_be_found() -> None:
 
 
 def every_option() -> set[str]:
-    found, waiting = {"--help"}, [typer.main.get_command(app)]
+    found, waiting = {"--help"}, [all_commands()]
     while waiting:
         command: Any = waiting.pop()
         waiting += getattr(command, "commands", {}).values()
@@ -104,7 +103,7 @@ def test_links_lead_to_files(document: Path) -> None:
 
 
 def test_documents_that_the_code_names_exist() -> None:
-    for path in (ROOT / "lapgs_plugin").rglob("*.py"):
+    for path in (*ROOT.glob("lapgs_plugin/**/*.py"), *ROOT.glob("lapgs_bench/**/*.py")):
         for named in re.findall(r"(?<![\w/])(?:docs|patches)/[\w./-]+\.md", path.read_text(encoding="utf-8")):
             assert (ROOT / named).is_file(), (path, named)
 

@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from typer.testing import CliRunner
 
 import lapgs_plugin
 from lapgs_plugin import ops
-from lapgs_plugin.adapters.registry import BACKBONES, adapter_class
+from lapgs_plugin.adapters.registry import adapter_class
+from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.plan import Stage
@@ -32,8 +34,9 @@ from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes.sample import make_sample_scene
-from lapgs_plugin.training.strategies import STRATEGIES
+from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
+from tests.plugin_package import REGISTRIES
 
 try:
     import tomllib
@@ -61,15 +64,12 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     monkeypatch.syspath_prepend(tmp_path)
     for registry in REGISTRIES:
-        vars(registry).pop("_found", None)
+        vars(registry).pop("entries", None)
     yield tmp_path
     for registry in REGISTRIES:
-        vars(registry).pop("_found", None)
+        vars(registry).pop("entries", None)
     for name in [name for name in sys.modules if name.split(".")[0] == "my_extension"]:
         del sys.modules[name]
-
-
-REGISTRIES = (SUPERVISIONS, BACKBONES, STRATEGIES, RASTERIZERS)
 
 
 def context(signed: bool) -> StageContext:
@@ -208,6 +208,30 @@ def test_the_rasterizer_blends_front_to_back_and_leaves_statistics() -> None:
     assert result.means2d.grad.shape == (2, 2)
 
 
+@pytest.mark.usefixtures("installed")
+def test_the_command_prints_the_levels_of_a_run(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), levels=2)
+    records = lapgs_plugin.RunArchive.open(run).manifest.records
+    printed = CliRunner().invoke(app, ["sizes", str(run)]).stdout
+    assert printed == "".join(f"{record.level} {record.num_gaussians}\n" for record in records)
+    assert "--least 0: expected at least 1" in str(
+        CliRunner().invoke(app, ["sizes", str(run), "--least", "0"]).exception
+    )
+    assert "Print the number of Gaussians" in CliRunner().invoke(app, ["--help"]).stdout
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_report_is_made_for_a_folder_with_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "runs/hall"
+    folder.mkdir(parents=True)
+    (folder / "capture.txt").write_text("f < 8")
+    monkeypatch.chdir(tmp_path)
+    for words in ([str(folder)], []):  # the newest in runs/
+        assert "report.html shows the capture" in CliRunner().invoke(app, ["report", *words]).stdout
+        assert (folder / "report.html").read_text() == "<pre>f &lt; 8</pre>"
+        (folder / "report.html").unlink()
+
+
 @pytest.fixture
 def tone(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The page's operation, as if its folder were in the package."""
@@ -236,7 +260,7 @@ def test_no_file_on_the_page_is_without_a_test() -> None:
         "pyproject.toml",
         *(
             f"my_extension/{name}.py"
-            for name in ("hooks", "depth", "supervision", "backbone", "strategy", "rasterizer")
+            for name in ("hooks", "depth", "supervision", "backbone", "strategy", "rasterizer", "sizes", "report")
         ),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}

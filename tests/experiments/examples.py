@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.expansion import RunSpec
-from lapgs_plugin.experiments.store import Job
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.expansion import RunSpec
+from lapgs_bench.experiments.store import Job
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
@@ -101,7 +101,7 @@ def starts(folder: Path) -> Counter[str]:
 
 def _job(folder: Path, spec: RunSpec, command: Sequence[str]) -> Job:
     own, log = folder / "runs" / spec.run_id, folder / "logs" / f"{spec.run_id}.log"
-    return Job(spec.run_id, spec, str(own), str(log), (Step(tuple(command), str(folder)),), True)
+    return Job(spec.run_id, spec, str(own), str(log), (Step(tuple(command), str(folder)),), True, "{}")
 
 
 def _python(code: str) -> tuple[str, ...]:

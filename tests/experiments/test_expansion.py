@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from lapgs_bench.experiments import commands
+from lapgs_bench.experiments.commands import Locations, run_steps
+from lapgs_bench.experiments.execution import prepare
+from lapgs_bench.experiments.expansion import plan_runs, scenes_of
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.schema import Experiment
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.standard import PRESETS
 from lapgs_plugin.cli.app import app
-from lapgs_plugin.cli.bench_experiment import _option_names
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments import commands
-from lapgs_plugin.experiments.commands import Locations, run_steps
-from lapgs_plugin.experiments.execution import prepare
-from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.standard import PRESETS
 from tests.experiments.examples import SMALL, run_spec
 
 

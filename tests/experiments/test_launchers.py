@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from lapgs_bench.experiments import launchers, worker
+from lapgs_bench.experiments.execution import execute
+from lapgs_bench.experiments.launchers import Launcher, WorkOrder, launch
+from lapgs_bench.experiments.settings import WorkerSettings
+from lapgs_bench.experiments.store import DONE, Outcome, ResultStore
+from lapgs_bench.experiments.worker import Slot, gpu_name
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments import launchers, worker
-from lapgs_plugin.experiments.execution import execute
-from lapgs_plugin.experiments.launchers import Launcher, WorkOrder, launch
-from lapgs_plugin.experiments.settings import WorkerSettings
-from lapgs_plugin.experiments.store import DONE, Outcome, ResultStore
-from lapgs_plugin.experiments.worker import Slot, gpu_name
 from tests.experiments.examples import COPY, START, copying_jobs, starts
 
 NOTE_ENVIRONMENT = START + (

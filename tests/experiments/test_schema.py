@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.cli.bench_experiment import _option_names
+from lapgs_bench.experiments.aggregate import check_table
+from lapgs_bench.experiments.expansion import plan_runs
+from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.schema import load_experiment
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.standard import EXPERIMENTS
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.aggregate import check_table
-from lapgs_plugin.experiments.expansion import plan_runs
-from lapgs_plugin.experiments.schema import load_experiment
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.standard import EXPERIMENTS
 
 GOOD = """
 name = "x"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_plugin.experiments.standard import EXPERIMENTS
+from lapgs_bench.experiments.standard import EXPERIMENTS
 
 SMOKE = EXPERIMENTS["smoke"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lapgs_plugin.experiments.standard import DATASETS, PRESETS, PaperTable
+from lapgs_bench.experiments.standard import DATASETS, PRESETS, PaperTable
 
 METHODS = ("Taming-3DGS", "FastGS", "Ours(Taming)", "Ours(FastGS)")
 NOT_ITS_OWN_MEAN = {

@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
-from lapgs_plugin.experiments import store as store_module
-from lapgs_plugin.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, RUNNING, Claim, Job, ResultStore
+from lapgs_bench.experiments import store as store_module
+from lapgs_bench.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, RUNNING, Claim, Job, ResultStore
 from tests.experiments.examples import run_spec
 
 RUNS = 3
@@ -29,7 +29,7 @@ class Workers(RuleBasedStateMachine):
         self.now = 1e9
         self.clock = mock.patch.object(store_module.time, "time", self.read_clock)
         self.clock.start()
-        self.jobs = [Job(f"run{i}", run_spec(i), "", "", (), True) for i in range(RUNS)]
+        self.jobs = [Job(f"run{i}", run_spec(i), "", "", (), True, "{}") for i in range(RUNS)]
         self.store = ResultStore.create(Path(self.folder.name) / "results.sqlite")
         self.store.plan(self.jobs)
         self.holder: dict[str, Claim] = {}

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
+from lapgs_bench.experiments import exports
+from lapgs_bench.experiments.aggregate import Cell, ResultTable, make_table
+from lapgs_bench.experiments.expansion import PlannedRun, plan_runs
+from lapgs_bench.experiments.rows import result_row
+from lapgs_bench.experiments.schema import Experiment
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.tables import latex, markdown
 from lapgs_plugin.errors import MissingExtraError, RunFolderError
-from lapgs_plugin.experiments import exports
-from lapgs_plugin.experiments.aggregate import Cell, ResultTable, make_table
-from lapgs_plugin.experiments.expansion import PlannedRun, plan_runs
-from lapgs_plugin.experiments.rows import result_row
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.tables import latex, markdown
 from tests.experiments.examples import copying_jobs, tiny_run
 
 SCENES = ("bonsai", "counter")

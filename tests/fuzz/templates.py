@@ -29,15 +29,15 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
+from lapgs_bench.experiments.commands import Locations
+from lapgs_bench.experiments.execution import STORE, prepare
+from lapgs_bench.experiments.expansion import plan_runs, scenes_of
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.rows import result_row
+from lapgs_bench.experiments.schema import load_experiment
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.store import ResultStore
 from lapgs_plugin import __version__
-from lapgs_plugin.experiments.commands import Locations
-from lapgs_plugin.experiments.execution import STORE, prepare
-from lapgs_plugin.experiments.expansion import plan_runs, scenes_of
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.rows import result_row
-from lapgs_plugin.experiments.schema import load_experiment
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.store import ResultStore
 from lapgs_plugin.files import BARE_RECORD, shipped
 from lapgs_plugin.runner.imported import BREAKDOWN, CFG_ARGS, TRAIN_INFO
 from lapgs_plugin.runs.archive import RunArchive

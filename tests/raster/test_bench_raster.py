@@ -12,12 +12,13 @@ import torch
 from gsplat.cuda import _wrapper
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli.bench import bench_app
+from lapgs_bench.app import app
+from lapgs_bench.kernels import gsplat_on_cpu
+from lapgs_bench.kernels import raster as bench_raster
+from lapgs_bench.kernels.gsplat_on_cpu import GsplatTorchRasterizer
+from lapgs_bench.kernels.random_scene import blended_per_pixel, make_scene
+from lapgs_bench.kernels.raster import CASES, FAST, GSPLAT, ORACLE, BenchCase, CaseResult, planned_turns
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation import bench_gsplat, bench_raster
-from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
-from lapgs_plugin.evaluation.bench_raster import CASES, FAST, GSPLAT, ORACLE, BenchCase, CaseResult, planned_turns
-from lapgs_plugin.evaluation.bench_scene import blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.reference_raster import OracleRasterizer
 from tests.raster.scenes import Case, gradients, pixel_weights, random_case
@@ -60,7 +61,7 @@ def test_gsplat_is_as_it_was_after_a_call(monkeypatch: pytest.MonkeyPatch) -> No
     kernel = _wrapper.rasterize_to_indices_in_range
     case = faint_case()
     case.render(GsplatTorchRasterizer())
-    monkeypatch.setattr(bench_gsplat, "_weights_from_alphas", None)
+    monkeypatch.setattr(gsplat_on_cpu, "_weights_from_alphas", None)
     with pytest.raises(TypeError):
         case.render(GsplatTorchRasterizer())
     assert _wrapper.rasterize_to_indices_in_range is kernel
@@ -81,9 +82,9 @@ def test_blended_per_pixel_counts_what_is_blended() -> None:
         counted += len(found[0])
         return found
 
-    kernel = bench_gsplat._indices_in_range
+    kernel = gsplat_on_cpu._indices_in_range
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_gsplat, "_indices_in_range", counting)
+        patch.setattr(gsplat_on_cpu, "_indices_in_range", counting)
         GsplatTorchRasterizer()(scene.field, scene.camera, background=torch.zeros(3))
     # A sample of pixels against all of them.
     assert blended_per_pixel(scene, pixels=2000) == pytest.approx(counted / (48 * 32), rel=0.05)
@@ -144,7 +145,7 @@ def test_promises_are_checked() -> None:
 def test_command_writes_everything_it_measured(tmp_path: Path) -> None:
     target = tmp_path / "bench.json"
     outcome = CliRunner().invoke(
-        bench_app, ["raster", "--sizes", "48x32/100", "--repeats", "2", "--json", str(target), "--check"]
+        app, ["raster", "--sizes", "48x32/100", "--repeats", "2", "--json", str(target), "--check"]
     )
     assert outcome.exit_code == 0, outcome.output
     assert "48x32" in outcome.output
@@ -170,10 +171,10 @@ def test_check_exits_with_one_when_a_promise_is_missed(monkeypatch: pytest.Monke
         return result(case, loss_share=0.5)
 
     monkeypatch.setattr(bench_raster, "run_case", measured)
-    checked = CliRunner().invoke(bench_app, ["raster", "--sizes", "200x150", "--check"])
+    checked = CliRunner().invoke(app, ["raster", "--sizes", "200x150", "--check"])
     assert checked.exit_code == 1
     assert "missed 200x150/2000: the loss adds 50%" in checked.output
-    assert CliRunner().invoke(bench_app, ["raster", "--sizes", "200x150"]).exit_code == 0
+    assert CliRunner().invoke(app, ["raster", "--sizes", "200x150"]).exit_code == 0
 
 
 def test_float64_leaves_gsplat_out() -> None:
@@ -197,6 +198,6 @@ def test_contenders_compute_the_same_loss() -> None:
     ],
 )
 def test_bad_options_are_refused_before_anything_is_timed(arguments: list[str], message: str) -> None:
-    outcome = CliRunner().invoke(bench_app, ["raster", *arguments])
+    outcome = CliRunner().invoke(app, ["raster", *arguments])
     assert isinstance(outcome.exception, UserInputError)
     assert message in str(outcome.exception)

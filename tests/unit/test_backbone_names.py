@@ -9,12 +9,10 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.adapters.registry import OWN
-
-PACKAGE = Path(__file__).parents[2] / "lapgs_plugin"
+from tests.package_strings import PACKAGES, ROOT
 
 EXCEPTIONS = {
-    "reference_raster/standins": "take the place of the backbones' CUDA modules, one table of settings for all",
-    "experiments/data": "data of standard experiments and of the paper's tables",
+    "lapgs_plugin/reference_raster/standins": "the backbones' CUDA modules on a CPU, one table of settings for all",
 }
 """Folders whose files may name any backbone, and why."""
 
@@ -33,19 +31,19 @@ def names_in(source: str) -> Iterator[tuple[int, str]]:
 
 
 def modules() -> list[Path]:
-    """Modules of the package that may name no backbone, or only their own."""
-    found = [path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py"))]
+    """Modules of the packages that may name no backbone, or only their own."""
+    found = [path.relative_to(ROOT) for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
     return [path for path in found if not any(path.is_relative_to(folder) for folder in EXCEPTIONS)]
 
 
 def test_no_module_names_a_backbone_that_is_not_its_own() -> None:
-    own = {Path("adapters", f"{name}.py") for name in OWN}
+    own = {Path("lapgs_plugin/adapters", f"{name}.py") for name in OWN}
     assert len(own) == 8
     found = {
         f"{path}:{line}: {text}"
         for path in modules()
         if path not in own
-        for line, text in names_in((PACKAGE / path).read_text(encoding="utf-8"))
+        for line, text in names_in((ROOT / path).read_text(encoding="utf-8"))
     }
     assert found == set()
 

@@ -11,8 +11,8 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from lapgs_bench.experiments.worker import RunFailedError
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError, printable
-from lapgs_plugin.experiments.worker import RunFailedError
 from lapgs_plugin.limits import FRAMES, PHOTO_PIXELS, PHOTO_SIDE, VIEW_PIXELS, Limit
 from lapgs_plugin.rendering.clip import render_size
 from lapgs_plugin.scenes import load_scene

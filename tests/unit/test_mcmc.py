@@ -453,13 +453,11 @@ def test_options_of_both_are_refused() -> None:
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
-def test_manifests_of_any_version_are_read(hierarchy: str) -> None:
+def test_manifests_are_read(hierarchy: str) -> None:
     density = Densification(strategy=MCMC, options=Mcmc(cap_max=9))
     chosen = TrainSettings(hierarchy=hierarchy, densification=density)
     manifest = ring_manifest(chosen)
     assert settings_from_manifest(manifest).for_manifest() == chosen.for_manifest()
-    older = {name: value for name, value in manifest.settings.items() if name != "residual_resets"}
-    assert settings_from_manifest(replace(manifest, settings=older)).for_manifest() == chosen.for_manifest()
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])

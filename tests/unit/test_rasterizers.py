@@ -15,9 +15,9 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
+from lapgs_bench.kernels.gsplat_on_cpu import _cuda_parts_replaced
 from lapgs_plugin.adapters.fastgs import Adapter as FastgsAdapter
 from lapgs_plugin.errors import MissingExtraError, UserInputError
-from lapgs_plugin.evaluation.bench_gsplat import _cuda_parts_replaced
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_transmittance

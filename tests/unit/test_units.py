@@ -287,7 +287,7 @@ def record(level: int, start: int | None, end: int) -> LevelRecord:
         ),
         (100, 100, {1: 20.0, 0: 19.5}, ["level 0 changes the PSNR of held-out images by -0.50"]),
         (100, 9, {2: 10.0, 1: 20.0, 0: 20.0}, ["level 0 ended with 9 of the 100", r"by \+0.00 dB"]),
-        (None, 1, {0: 20.0}, []),  # of an older version, without views of level 1
+        (None, 1, {0: 20.0}, []),  # not recorded, and no views of level 1
     ],
 )
 def test_levels_that_matter_little_are_named(

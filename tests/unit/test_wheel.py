@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from lapgs_plugin.cli.help import topics
-from tests.package_strings import ROOT, said
+from tests.package_strings import PACKAGES, ROOT, said
 
 BUILD = """
 import sys
 from setuptools import setup  # replaces distutils
 from distutils.core import run_setup
-run_setup("setup.py", ["-q", "build_py", "--no-compile", "--build-lib", sys.argv[1]], "commandline").run_commands()
+words = "-q build_py --no-compile --build-lib FOLDER dist_info --output-dir FOLDER".replace("FOLDER", sys.argv[1])
+run_setup("setup.py", words.split(), "commandline").run_commands()
 """
 USE = """
 from lapgs_plugin.cli.app import app
@@ -48,8 +49,9 @@ def test_the_commands_of_an_installed_wheel_find_their_files(site: Path, tmp_pat
     assert set(recipes) == {path.stem for path in ROOT.glob("patches/*.toml")}
 
 
-def test_a_wheel_has_every_file_of_the_package(site: Path) -> None:
-    own = {path for path in (ROOT / "lapgs_plugin").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+def test_a_wheel_has_every_file_of_the_packages(site: Path) -> None:
+    paths = {path for package in PACKAGES for path in (ROOT / package).rglob("*")}
+    own = {path for path in paths if path.is_file() and "__pycache__" not in path.parts}
     lacking = {str(path.relative_to(ROOT)) for path in own if not (site / path.relative_to(ROOT)).is_file()}
     assert lacking == {"lapgs_plugin/README.md"}  # the map of the code, for its developers
 

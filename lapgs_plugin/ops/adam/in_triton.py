@@ -20,7 +20,7 @@ BLOCK = 512
 COLUMNS = tuple(f"columns{i}" for i in range(5))
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _move(
     values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor,
     rate: float, rest: float, unbias: float, scale: float, keep1: float, take1: float, keep2: float, take2: float,
@@ -48,7 +48,7 @@ def _move(
         tl.store(values + places, moved, here)
 
 
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=("n",))
 def _kernel(
     values0: tl.tensor, gradients0: tl.tensor, means0: tl.tensor, squares0: tl.tensor,
     rate0: float, rest0: float, unbias0: float,
@@ -71,7 +71,7 @@ def _kernel(
     _move(values4, gradients4, means4, squares4, rate4, rest4, unbias4, scale, k1, t1, k2, t2, eps, n, columns4, block)
 
 
-@triton.jit(do_not_specialize=("n",))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=("n",))
 def _tensor_kernel(
     values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor, rate: float, unbias: float,
     keep1: float, take1: float, keep2: float, take2: float, eps: float, n: int, block: tl.constexpr,

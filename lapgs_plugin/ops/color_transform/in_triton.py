@@ -21,7 +21,7 @@ SIZES = ("n", "by_view", "by_channel", "out_view", "out_channel")
 """Arguments that differ between image sizes: one compiled kernel serves all."""
 
 
-@triton.jit(do_not_specialize=SIZES[:3])  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=SIZES[:3])
 def _apply(
     image: tl.tensor, transform: tl.tensor, out: tl.tensor, n: int, by_view: int, by_channel: int,
     by_pixel: tl.constexpr, block: tl.constexpr,
@@ -39,7 +39,7 @@ def _apply(
         tl.store(out + view * by_view + channel * by_channel + places * by_pixel, value, here)
 
 
-@triton.jit(do_not_specialize=SIZES)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=SIZES)
 def _gradients(
     image: tl.tensor, transform: tl.tensor, by_out: tl.tensor, by_image: tl.tensor, by_transform: tl.tensor, n: int,
     by_view: int, by_channel: int, out_view: int, out_channel: int,

@@ -11,7 +11,7 @@ from lapgs_plugin.ops.launch import blocks, launch
 BLOCK = 512
 
 
-@triton.jit(do_not_specialize=("half_width", "half_height", "n", "views"))  # type: ignore[untyped-decorator]  # no types
+@triton.jit(do_not_specialize=("half_width", "half_height", "n", "views"))  # no types
 def _kernel(
     gradient: tl.tensor, radii: tl.tensor, norms: tl.tensor, counts: tl.tensor,
     half_width: float, half_height: float, n: tl.tensor, views: int, block: tl.constexpr,

@@ -34,7 +34,7 @@ OF_ANY_VALUE = (
 )
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _place(width: int, colors: tl.constexpr, interleaved: tl.constexpr, block: tl.constexpr, beyond: tl.constexpr):  # type: ignore[no-untyped-def]
     """Return the first of two columns of each thread, and its colour; neighbouring threads are neighbours in memory."""
     places, pairs = tl.program_id(0) * block + tl.arange(0, block), (width + 1) // 2
@@ -43,7 +43,7 @@ def _place(width: int, colors: tl.constexpr, interleaved: tl.constexpr, block: t
     return tl.where(places < pairs * colors, column, width + beyond), color
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _shifted(sums: tl.tuple, row: tl.tensor, window: tl.constexpr, radius: tl.constexpr) -> tl.tuple:
     """Add a row to the sums of output rows that are not complete: (the complete one, the others with a new one)."""
     after = ()
@@ -52,7 +52,7 @@ def _shifted(sums: tl.tuple, row: tl.tensor, window: tl.constexpr, radius: tl.co
     return sums[0] + window[2 * radius] * row, after + (window[0] * row,)  # noqa: RUF005  # Triton compiles no stars
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _ssim(
     mean: tl.tensor, mean_y: tl.tensor, squares: tl.tensor, products: tl.tensor, c1: tl.constexpr, c2: tl.constexpr
 ) -> tl.tuple:  # fmt: skip
@@ -66,7 +66,7 @@ def _ssim(
     return ssim, slope, -ssim * of_variances, 2.0 * luminance * per
 
 
-@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
@@ -133,7 +133,7 @@ def _loss_kernel(
     tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
 
 
-@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _gradient_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor,
     by_loss: tl.tensor, gradient: tl.tensor,

@@ -12,7 +12,7 @@ from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS
 BLOCK = 256
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _turned(
     w: tl.tensor, i: tl.tensor, j: tl.tensor, k: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor
 ) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
@@ -26,7 +26,7 @@ def _turned(
     )
 
 
-@triton.jit(do_not_specialize=("amount", "seed", "n"))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=("amount", "seed", "n"))
 def _kernel(
     means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
     amount: float, seed: int, n: int, sharpness: tl.constexpr, faint: tl.constexpr, block: tl.constexpr,

@@ -11,7 +11,7 @@ from lapgs_plugin.ops.launch import blocks, launch
 BLOCK = 512
 
 
-@triton.jit(do_not_specialize=("by_opacity", "by_scale", "n"))  # type: ignore[untyped-decorator]  # no types
+@triton.jit(do_not_specialize=("by_opacity", "by_scale", "n"))  # no types
 def _kernel(
     logits: tl.tensor, log_scales: tl.tensor, by_logits: tl.tensor, by_log_scales: tl.tensor,
     by_opacity: float, by_scale: float, n: int, block: tl.constexpr,

@@ -29,7 +29,7 @@ OF_ANY_VALUE = (
 )
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _across(row: tl.tensor, stride: int, weights: tl.tuple, inside: tl.tensor, taps: tl.constexpr) -> tl.tensor:
     """Return sums over neighbours in a row."""
     total = weights[0] * tl.load(row, inside, 0.0)
@@ -38,7 +38,7 @@ def _across(row: tl.tensor, stride: int, weights: tl.tuple, inside: tl.tensor, t
     return total
 
 
-@triton.jit(do_not_specialize=OF_ANY_VALUE)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _kernel(
     source: tl.tensor, added: tl.tensor, out: tl.tensor,
     first_row: tl.tensor, row_weights: tl.tensor, first_column: tl.tensor, column_weights: tl.tensor,

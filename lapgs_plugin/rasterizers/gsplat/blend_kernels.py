@@ -69,12 +69,12 @@ FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
 """At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _multiply(a: tl.tensor, b: tl.tensor) -> tl.tensor:
     return a * b
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _exp2(x: tl.tensor) -> tl.tensor:
     """Return 2 ** x; where compiled, in one instruction instead of four, with 0 for denormal results."""
     if INTERPRETED:
@@ -82,7 +82,7 @@ def _exp2(x: tl.tensor) -> tl.tensor:
     return tl.inline_asm_elementwise("ex2.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _inverse(x: tl.tensor) -> tl.tensor:
     """Return 1 / x of numbers that are neither denormal nor huge, to one unit in the last place."""
     if INTERPRETED:
@@ -90,7 +90,7 @@ def _inverse(x: tl.tensor) -> tl.tensor:
     return tl.inline_asm_elementwise("rcp.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def load_four(start: tl.tensor) -> tl.tensor:
     """Load four numbers that begin at a multiple of 16 bytes; where compiled, in one instruction."""
     if INTERPRETED:
@@ -101,7 +101,7 @@ def load_four(start: tl.tensor) -> tl.tensor:
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
     """Return, in each thread, `x` of the thread whose index along `axis`, 0 or 1, differs in one bit.
 
@@ -120,7 +120,7 @@ def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
     )
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _ballot(wanted: tl.tensor) -> tl.tensor:
     """Return, in all threads of a warp, a bit for each of them; `wanted` is (threads,)."""
     if INTERPRETED:
@@ -132,7 +132,7 @@ def _ballot(wanted: tl.tensor) -> tl.tensor:
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _count_bits(x: tl.tensor) -> tl.tensor:
     """Return how many bits of each number are set."""
     if INTERPRETED:
@@ -143,7 +143,7 @@ def _count_bits(x: tl.tensor) -> tl.tensor:
     return tl.inline_asm_elementwise("popc.b32 $0, $1;", "=r,r", [x], tl.int32, True, 1)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _before(x: tl.tensor, adds: tl.constexpr) -> tuple[tl.tensor, tl.tensor]:
     """Return the sum, or else the product, of `x` over the Gaussians before each along axis 1, and over all."""
     index = tl.arange(0, SPLAT_LANES)[None, :, None, None]
@@ -156,7 +156,7 @@ def _before(x: tl.tensor, adds: tl.constexpr) -> tuple[tl.tensor, tl.tensor]:
     return before, x
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr) -> tl.tensor:
     """Add up two threads' values along axis 0: those of `one` in the thread without the bit, of `other` in that with.
 
@@ -166,7 +166,7 @@ def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr) -> tl.tens
     return tl.where(has, other, one) + _swapped(tl.where(has, one, other), 0, bit)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _reaches(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     width: tl.constexpr, height: tl.constexpr,
@@ -186,7 +186,7 @@ def _reaches(
     return found | (square * 0.99999 + b * on_row * near_y <= limit)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _region(
     across: int, tiles: int, rows: tl.constexpr, tile: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:
@@ -199,13 +199,13 @@ def _region(
     return index, index // tiles, row, column
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _pairs_of(index: tl.tensor, offsets: tl.tensor, all_tiles: int, pairs: int) -> tuple[tl.tensor, tl.tensor]:
     """Return the first pair of a tile, and the one after its last."""
     return tl.load(offsets + index), tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
 
 
-@triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # type: ignore[untyped-decorator]  # no types
+@triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # no types
 def _reach_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     across: int, tiles: int, all_tiles: int, pairs: int,
@@ -235,13 +235,13 @@ def _reach_kernel(
         block += threads // 32 * regions
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _first_word(index: tl.tensor, begin: tl.tensor, regions: tl.constexpr) -> tl.tensor:
     """Return where the words of a tile begin: they have 32 pairs each, the last one of a tile maybe fewer."""
     return (begin // 32 + index) * regions
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _pairs(
     begin: tl.tensor, stop: tl.tensor, flat: tl.tensor, words: tl.tensor, regions: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor]:
@@ -251,7 +251,7 @@ def _pairs(
     return gaussian, tl.load(words + pair // 32 * regions, begin + pair // 32 * 32 < stop, 0)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _fill(
     queue: tl.tensor, begin: tl.tensor, stop: tl.tensor, head: tl.tensor, tail: tl.tensor,
     gaussian: tl.tensor, word: tl.tensor, flat: tl.tensor, words: tl.tensor,
@@ -282,7 +282,7 @@ def _fill(
     return begin, words, tail, gaussian, word
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _bucket(
     queue: tl.tensor, head: tl.tensor, tail: tl.tensor, another: tl.tensor, records: tl.tensor,
     splats: tl.constexpr, record: tl.constexpr,
@@ -302,7 +302,7 @@ def _bucket(
     return gaussian, order < tail, x, y, a, b, c, opacity, red, green, blue
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _alphas(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor, there: tl.tensor
 ) -> tl.tensor:
@@ -313,7 +313,7 @@ def _alphas(
     return tl.where(there & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
     """Return the transmittances before and after each Gaussian, and after the bucket."""
     left = 1.0 - alpha
@@ -326,7 +326,7 @@ def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tens
     return before * tl.where(second, by_first, 1.0), after, transmittance * by_all
 
 
-@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "of_background"))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "of_background"))
 def _forward_kernel(
     records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
@@ -382,7 +382,7 @@ def _forward_kernel(
     tl.store(pixel + 2, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _add_gradients(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
@@ -420,7 +420,7 @@ def _add_gradients(
         tl.atomic_add(others + gaussian, tl.where(lane == 0, value, 0.0), there & (lane == 0), sem="relaxed")
 
 
-@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def _backward_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,

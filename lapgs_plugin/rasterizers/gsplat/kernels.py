@@ -34,7 +34,7 @@ BEYOND = tl.constexpr(0.3)
 NOT_SPECIALIZED = ("n", "cameras", "active", "signed")
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911, PLR0912  # a return for each k, of which Triton compiles one
     """Return the k-th real spherical harmonic of a unit direction, in the order and with the signs of 3DGS."""
     xx, yy, zz = x * x, y * y, z * z
@@ -71,7 +71,7 @@ def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tens
     return -0.5900435899266435 * x * (xx - 3.0 * yy)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _basis_x(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
     """Return the derivative of `_basis` by x."""
     xx, yy, zz = x * x, y * y, z * z
@@ -102,7 +102,7 @@ def _basis_x(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
     return 0.0 * x
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _basis_y(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
     """Return the derivative of `_basis` by y."""
     xx, yy, zz = x * x, y * y, z * z
@@ -133,7 +133,7 @@ def _basis_y(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
     return 0.0 * x
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
     """Return the derivative of `_basis` by z."""
     xx, yy, zz = x * x, y * y, z * z
@@ -158,7 +158,7 @@ def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.te
     return 0.0 * x
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, wanted: tl.tensor) -> None:
     """Store four numbers from a multiple of 16 bytes on where wanted; where compiled, in one instruction."""
     if INTERPRETED:
@@ -173,7 +173,7 @@ def _store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: t
         )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _unit_quaternions(quaternions: tl.tensor, row: tl.tensor) -> tl.tensor:
     """Return w, x, y, z of unit length, and one over the length they had."""
     w, x, y, z = load_four(quaternions + 4 * row)
@@ -181,7 +181,7 @@ def _unit_quaternions(quaternions: tl.tensor, row: tl.tensor) -> tl.tensor:
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _rotation(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:
     """Return the rotation matrix of a unit quaternion, row by row."""
     return (
@@ -191,19 +191,19 @@ def _rotation(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tens
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _load_three(start: tl.tensor) -> tl.tensor:
     return tl.load(start), tl.load(start + 1), tl.load(start + 2)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _store_three(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, wanted: tl.tensor) -> None:
     tl.store(start, a, wanted)
     tl.store(start + 1, b, wanted)
     tl.store(start + 2, c, wanted)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _covariance(
     a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, e: tl.tensor, f: tl.tensor,
     g: tl.tensor, h: tl.tensor, i: tl.tensor,
@@ -215,7 +215,7 @@ def _covariance(
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _shape(quaternions: tl.tensor, log_scales: tl.tensor, row: tl.tensor) -> tl.tensor:
     """Return w, x, y, z of unit quaternions and one over their length, scales, and covariances as `_covariance` has."""
     w, x, y, z, length = _unit_quaternions(quaternions, row)
@@ -226,12 +226,12 @@ def _shape(quaternions: tl.tensor, log_scales: tl.tensor, row: tl.tensor) -> tl.
     return w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _is_visible(radii: tl.tensor, placed: tl.tensor) -> tl.tensor:
     return (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _direction(centre: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, visible: tl.tensor) -> tl.tensor:
     """Return unit directions from a camera's centre to visible means, and one over their distances."""
     centre_x, centre_y, centre_z = _load_three(centre)
@@ -240,7 +240,7 @@ def _direction(centre: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, visi
     return x * near, y * near, z * near, near
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _seen_from(
     poses: tl.tensor, intrinsics: tl.tensor, camera: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor,
     width: int, height: int,
@@ -266,7 +266,7 @@ def _seen_from(
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _rows_of_projection(
     poses: tl.tensor, camera: tl.tensor, by_x: tl.tensor, x_by_z: tl.tensor, by_y: tl.tensor, y_by_z: tl.tensor
 ) -> tl.tensor:
@@ -281,7 +281,7 @@ def _rows_of_projection(
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _times(
     xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
     x: tl.tensor, y: tl.tensor, z: tl.tensor,
@@ -290,7 +290,7 @@ def _times(
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _color(
     sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int, coefficients: tl.constexpr
 ) -> tl.tensor:
@@ -318,18 +318,18 @@ def _color(
     return red, green, blue
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _is_used(k: tl.constexpr, active: int) -> tl.tensor:
     return tl.full((1,), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _used_basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int) -> tl.tensor:
     """Return the k-th spherical harmonic, 0 if it is not active."""
     return tl.where(_is_used(k, active), _basis(k, x, y, z), 0.0)
 
 
-@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
 def _project_kernel(
     means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor, sh: tl.tensor,
     poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor,
@@ -389,7 +389,7 @@ def _project_kernel(
         placed += n
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _of_covariance(
     wide: tl.tensor, skew: tl.tensor, high: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, visible: tl.tensor
 ) -> tl.tensor:
@@ -405,7 +405,7 @@ def _of_covariance(
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _of_place(
     pose: tl.tensor, u: tl.tensor, v: tl.tensor, limited_u: tl.tensor, limited_v: tl.tensor, inverse: tl.tensor,
     x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor,
@@ -433,7 +433,7 @@ def _of_place(
     )
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _store_shape_gradients(
     by_quaternion: tl.tensor, by_log_scale: tl.tensor, rows: tl.tensor, here: tl.tensor,
     w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, length: tl.tensor,
@@ -459,7 +459,7 @@ def _store_shape_gradients(
     _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
 
 
-@triton.jit(do_not_specialize=("width", "height", "n", "cameras"))  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=("width", "height", "n", "cameras"))
 def _shape_gradient_kernel(
     means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
     poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor, others: tl.tensor,
@@ -518,7 +518,7 @@ def _shape_gradient_kernel(
     )  # fmt: skip
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _slopes(
     k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
     red: tl.tensor, green: tl.tensor, blue: tl.tensor, of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor,
@@ -529,7 +529,7 @@ def _slopes(
     return _basis_x(k, x, y, z) * weight, _basis_y(k, x, y, z) * weight, _basis_z(k, x, y, z) * weight
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _by_direction(
     sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
     of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor, coefficients: tl.constexpr,
@@ -560,13 +560,13 @@ def _by_direction(
     return by_x, by_y, by_z
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _one_of(sums: tl.tensor, k: tl.tensor, one: tl.constexpr) -> tl.tensor:
     """Return a row (g,) of sums (k, g), which a thread has all of."""
     return tl.sum(tl.where(k == one, sums, 0.0), 0)
 
 
-@triton.jit  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit
 def _store_sh(
     by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor, k: tl.tensor, here: tl.tensor,
     coefficients: tl.constexpr,
@@ -587,7 +587,7 @@ def _store_sh(
             _store_three(into, _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), here)
 
 
-@triton.jit(do_not_specialize=NOT_SPECIALIZED)  # type: ignore[untyped-decorator]  # Triton ships no types
+@triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def _color_gradient_kernel(
     means: tl.tensor, centres: tl.tensor, sh: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor,
     by_mean: tl.tensor, by_sh: tl.tensor,

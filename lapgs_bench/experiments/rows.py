@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lapgs_bench.experiments.commands import measured_folder
+from lapgs_bench.experiments.expansion import RunSpec
+from lapgs_bench.experiments.store import Job
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.experiments.commands import measured_folder
-from lapgs_plugin.experiments.expansion import RunSpec
-from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord

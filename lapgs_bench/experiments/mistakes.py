@@ -6,12 +6,11 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
+from lapgs_bench.experiments.expansion import PlannedRun
+from lapgs_bench.experiments.schema import Experiment, ExperimentError
+from lapgs_bench.experiments.settings import Selection
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.expansion import PlannedRun
-from lapgs_plugin.experiments.schema import Experiment, ExperimentError
-from lapgs_plugin.experiments.settings import Selection
 
 
 class Mistakes:
@@ -61,25 +60,21 @@ class Mistakes:
         number = next(i for i, variant in enumerate(experiment.variants) if variant.name == run.variant)
         variant, backbone = experiment.variants[number], experiment.backbones[spec.backbone]
         own, its = f"variants.{number}", f"backbones.{spec.backbone}"
-        keys: dict[str, tuple[str, Any]] = {
-            "seed": ("--seeds" if selection.seeds else f"seeds.{experiment.seeds.index(spec.seed)}", spec.seed),
-            "iterations": (
-                "--iterations" if selection.iterations else f"{own}.iterations" if variant.iterations else "iterations",
-                spec.iterations,
-            ),
-            "resolution": (f"{own if variant.resolution else scene}.resolution", spec.resolution),
-            "images": (f"{scene}.images", spec.images),
+        iterations = f"{own}.iterations" if variant.iterations else "iterations"
+        keys = {
+            "seed": "--seeds" if selection.seeds else f"seeds.{experiment.seeds.index(spec.seed)}",
+            "iterations": "--iterations" if selection.iterations else iterations,
+            "resolution": f"{own if variant.resolution else scene}.resolution",
+            "images": f"{scene}.images",
+            "rasterizer": f"{its}.rasterizer",
+            **{name: f"{its}.options.{name}" for name in backbone.options},
+            **{name: f"{own}.options.{name}" for name in variant.options},
         }
-        if spec.rasterizer is not None:
-            keys["rasterizer"] = (f"{its}.rasterizer", spec.rasterizer)
-        for name, value in spec.options.items():
-            if name in variant.options or name in backbone.options:
-                keys[name] = (f"{own if name in variant.options else its}.options.{name}", value)
-        whole = f"{own} ({json.dumps(variant.name, ensure_ascii=False)} on {spec.backbone})"
+        values = {name: value for name, value in {**vars(spec), **spec.options}.items() if value is not None}
         return {
-            "run": whole,
+            "run": f"{own} ({json.dumps(variant.name, ensure_ascii=False)} on {spec.backbone})",
             "scene": self.scene_key(spec.scene),
-            **{name: f"{key} = {json.dumps(value):.80}" for name, (key, value) in keys.items()},
+            **{name: f"{key} = {json.dumps(values[name]):.80}" for name, key in keys.items() if name in values},
         }
 
     def _scene(self, name: str) -> str:

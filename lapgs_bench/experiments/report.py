@@ -13,14 +13,15 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
+from lapgs_bench.experiments.commands import IMPORTED
+from lapgs_bench.experiments.execution import RUNS
+from lapgs_bench.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.errors import LapgsError, RunFolderError
-from lapgs_plugin.experiments.commands import IMPORTED
-from lapgs_plugin.experiments.execution import RUNS
-from lapgs_plugin.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
 from lapgs_plugin.files import is_folder, write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
+from lapgs_plugin.reports.folders import FolderReport
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
 from lapgs_plugin.runs.archive import RunArchive
@@ -28,7 +29,7 @@ from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
 from lapgs_plugin.untrusted import read_text, shortened
 
-TEMPLATE = "experiment.html.jinja"
+TEMPLATE = Path(__file__).with_name("experiment.html.jinja")
 COLORS = 8
 """Number of styles of lines and arrows; later variants reuse them."""
 COUNTS = {
@@ -102,28 +103,28 @@ class Results:
         return f"{scene}, {backbone}" if several else scene
 
 
-def write_experiment_report(folder: Path, options: RenderOptions) -> Path:
-    """Write report.html into a folder of `lapgs bench`, and return its path.
+class ExperimentReport(FolderReport):
+    """Report on a folder of `lapgs bench`."""
 
-    Raises:
-        RunFolderError: there are no results, or the file cannot be written.
-    """
-    results = Results.read(folder)
-    title, tables = _tables(folder / MARKDOWN)
-    page = render_page(
-        TEMPLATE,
-        title=title or str(results.rows[0].get("experiment", folder.name)),
-        tables=tables,
-        variants={name: results.style(name) for name in results.variants},
-        num_runs=len({row["run"] for row in results.rows}),
-        arrows=_time_arrows(results),
-        breakdown=_breakdown(results),
-        overhead=_overhead(results),
-        parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
-        machines=_machines(results),
-    )
-    write_text(folder / REPORT, page)
-    return folder / REPORT
+    marker = CSV
+
+    def write(self, folder: Path, options: RenderOptions) -> Path:
+        results = Results.read(folder)
+        title, tables = _tables(folder / MARKDOWN)
+        page = render_page(
+            TEMPLATE,
+            title=title or str(results.rows[0].get("experiment", folder.name)),
+            tables=tables,
+            variants={name: results.style(name) for name in results.variants},
+            num_runs=len({row["run"] for row in results.rows}),
+            arrows=_time_arrows(results),
+            breakdown=_breakdown(results),
+            overhead=_overhead(results),
+            parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
+            machines=_machines(results),
+        )
+        write_text(folder / REPORT, page)
+        return folder / REPORT
 
 
 def _tables(path: Path) -> tuple[str, str]:
@@ -246,11 +247,7 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
 
 
 def _open(folder: Path, row: Row) -> MeasuredRun:
-    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved.
-
-    Raises:
-        RunFolderError: it is missing or damaged.
-    """
+    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved."""
     path = folder / RUNS / Path(str(row.get("folder", row["run"]))).name
     archive = RunArchive.open(path / IMPORTED if is_folder(path / IMPORTED) else path)
     return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})

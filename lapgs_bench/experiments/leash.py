@@ -1,4 +1,4 @@
-"""Run a command that ends with the process that started it: `python -m lapgs_plugin.experiments.leash CORES COMMAND...`
+"""Run a command that ends with the process that started it: `python -m lapgs_bench.experiments.leash CORES COMMAND...`
 
 The worker holds this process's standard input open. When the worker ends in any way, the pipe closes, and the command
 and all its children are killed. Otherwise they would overwrite the next attempt's files and use a GPU on which other
@@ -28,9 +28,6 @@ def main() -> int:
 def _kill_when_released(child: subprocess.Popen[bytes]) -> None:
     while os.read(sys.stdin.fileno(), 1):  # unbuffered, because a buffer's lock would block the end of this process
         pass
-    if sys.platform == "win32":
-        child.kill()
-        return
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
 

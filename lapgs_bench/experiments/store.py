@@ -14,7 +14,6 @@ import json
 import os
 import socket
 import sqlite3
-import sys
 import time
 import uuid
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -23,10 +22,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.expansion import RunSpec
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.expansion import RunSpec
 from lapgs_plugin.files import one_line_errors, require_own
 from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 
@@ -47,7 +46,6 @@ _TABLES = (
     """CREATE TABLE IF NOT EXISTS runs (
     run_id TEXT PRIMARY KEY,
     position INTEGER NOT NULL,
-    spec TEXT NOT NULL,
     job TEXT NOT NULL,
     state TEXT NOT NULL,
     owner TEXT,
@@ -81,7 +79,7 @@ class Job:
     log: str
     steps: tuple[Step, ...]
     evaluate: bool
-    defaults: str = ""
+    defaults: str
 
     def attempt(self, number: int) -> Job:
         """Return the job in a separate folder: a worker that lost its claim may still write to the previous one."""
@@ -134,6 +132,10 @@ class Outcome:
     record: dict[str, Any] | None
     error: str
 
+    @property
+    def ended(self) -> bool:
+        return self.state in (DONE, FAILED)
+
 
 class ResultStore:
     """An experiment's results. Each method is one transaction; threads may share an object.
@@ -183,11 +185,10 @@ class ResultStore:
         with _transaction(self._path) as connection:
             self._require_same_defaults(connection, jobs)
             for position, job in enumerate(jobs):
-                values = (job.run_id, position, json.dumps(asdict(job.spec)), job.to_json(), PENDING)
                 connection.execute(
-                    "INSERT INTO runs (run_id, position, spec, job, state) VALUES (?, ?, ?, ?, ?) "
+                    "INSERT INTO runs (run_id, position, job, state) VALUES (?, ?, ?, ?) "
                     "ON CONFLICT (run_id) DO UPDATE SET position = excluded.position",
-                    values,
+                    (job.run_id, position, job.to_json(), PENDING),
                 )
                 connection.execute(
                     "UPDATE runs SET job = ?, state = ?, claims = 0, error = NULL WHERE run_id = ? AND state IN (?, ?)",
@@ -303,8 +304,6 @@ def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[
 
 def _differences(one: str, other: str) -> str:
     """Return the first differences of two texts of `commands.defaults_of` in words."""
-    if not one:
-        return "an older version did not record them"
     advice = "choose another folder with --out"
     before, now = (
         parse_json(text, "the defaults of a run", dict[str, Any], error=RunFolderError, advice=advice)
@@ -326,8 +325,6 @@ def _abandoned(owner: str, lease_until: float, now: float) -> bool:
 
 
 def _alive(pid: int) -> bool:
-    if sys.platform == "win32":  # os.kill would end the process there; the lease decides
-        return True
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

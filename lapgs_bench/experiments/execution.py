@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from lapgs_bench.experiments.commands import Locations, defaults_of, run_steps
+from lapgs_bench.experiments.expansion import PlannedRun, SceneSpec
+from lapgs_bench.experiments.launchers import Launcher
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.schema import SampleScene
+from lapgs_bench.experiments.store import LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.commands import Locations, defaults_of, run_steps
-from lapgs_plugin.experiments.expansion import PlannedRun, SceneSpec
-from lapgs_plugin.experiments.launchers import Launcher
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.schema import SampleScene
-from lapgs_plugin.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
 from lapgs_plugin.files import FolderLock, one_line_errors
 from lapgs_plugin.scenes.resolution import parse_size
 
@@ -55,7 +55,9 @@ def prepare(
             if scene.sample is None:
                 where[scene.name] = scene, places.scene(scene)
             else:
-                _check_sample(scene.sample)
+                from lapgs_plugin.scenes.sample import check_sample_scene
+
+                check_sample_scene(*parse_size(scene.sample.size), scene.sample.views, scene.sample.points)
                 where[scene.name] = scene, _sample_folder(scene.name, scene.sample, folder)
     checkouts: dict[str, Path] = {}
     for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
@@ -77,17 +79,6 @@ def prepare(
                 Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None, defaults_of(spec)),
             )
     return list(jobs.values()), where
-
-
-def _check_sample(sample: SampleScene) -> None:
-    """Refuse options that no sample scene can have.
-
-    Raises:
-        UserInputError: the size, the views or the points are out of range.
-    """
-    from lapgs_plugin.scenes.sample import check_sample_scene
-
-    check_sample_scene(*parse_size(sample.size), sample.views, sample.points)
 
 
 def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
@@ -135,25 +126,25 @@ def execute(
     Raises:
         UserInputError: workers end without finishing a run.
     """
-    known = {outcome.run_id for outcome in store.outcomes(run_ids) if _ended(outcome)}
+    known = {outcome.run_id for outcome in store.outcomes(run_ids) if outcome.ended}
 
-    def look() -> list[Outcome]:
+    def all_ended() -> bool:
         outcomes = store.outcomes(run_ids)
         for outcome in outcomes:
-            if _ended(outcome) and outcome.run_id not in known:
+            if outcome.ended and outcome.run_id not in known:
                 known.add(outcome.run_id)
                 on_end(outcome)
-        return outcomes
+        return all(outcome.ended for outcome in outcomes)
 
-    while not all(_ended(outcome) for outcome in look()):
+    while not all_ended():
         if store.has_free(run_ids):
             before = len(known)
             launcher = start()
             try:
                 while launcher.running():
                     time.sleep(POLL_SECONDS)
-                    look()
-                look()
+                    all_ended()
+                all_ended()
                 failures = launcher.failures()
                 if failures and len(known) == before:
                     raise UserInputError(
@@ -165,7 +156,3 @@ def execute(
                 launcher.stop()
         time.sleep(POLL_SECONDS)
     return store.outcomes(run_ids)
-
-
-def _ended(outcome: Outcome) -> bool:
-    return outcome.state in (DONE, FAILED)

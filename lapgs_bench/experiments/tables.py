@@ -5,17 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from lapgs_plugin.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
+from lapgs_bench.experiments.aggregate import COLUMNS, Cell, Column, Group, Ratio, ResultTable, TableRow
+from lapgs_bench.experiments.schema import Table
 
 GROUPS_BESIDE = 3
 """Data sets or scenes side by side in a LaTeX table, as in the paper."""
+SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 TEX = {
     **{"N_GS": r"$N_{\mathrm{GS}}$", "rho": r"$\rho$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "±": r"$\pm$"},
     **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"},
+    GAIN: r"$\Delta$PSNR",
 }
 """Words and characters in LaTeX, besides the characters that a backslash escapes."""
-SPEEDUP, GAIN = "Speed-up", "Change of PSNR (dB)"
 NO_VALUE = "-"
 PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 2K and 4K"
 
@@ -23,11 +25,11 @@ PAPER_CONDITIONS = "30,000 iterations unless said; NVIDIA L40 at 1K, Pro6000 at 
 def markdown(table: ResultTable) -> str:
     """Write the table as Markdown."""
     lines = [f"# {table.experiment.title}", "", _legend(table), ""]
-    shape = table.experiment.table
-    write = _markdown_transposed if shape.transposed else _markdown_rows
     for group in (*table.groups, *table.scenes):
-        lines += [f"## {group.title}", "", *write(group, shape.columns), ""]
-        lines += [*group.notes, ""] if group.notes else []
+        header, *rows = _grid(group, table.experiment.table)
+        lines += [f"## {group.title}", "", _markdown_line(header), _markdown_line(["---"] * len(header))]
+        lines += [_markdown_line(row if len(row) > 1 else [f"**{row[0]}**", *[""] * (len(header) - 1)]) for row in rows]
+        lines += ["", *group.notes, ""] if group.notes else [""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -54,26 +56,20 @@ def _legend(table: ResultTable) -> str:
     return f"Measured: {table.measured}. {spread}{paper}. {against}"
 
 
-def _markdown_rows(group: Group, columns: Sequence[str]) -> Iterator[str]:
-    yield _markdown_line(["", *map(_heading, columns), SPEEDUP, GAIN])
-    yield _markdown_line(["---"] * (len(columns) + 3))
+def _grid(group: Group, shape: Table) -> Iterator[list[str]]:
+    """Yield the cells of a group line by line, its headings first. A line of one cell is the heading of a section."""
+    if shape.transposed:
+        yield ["", *(row.label for row in group.rows)]
+        for name in shape.columns:
+            yield [COLUMNS[name].heading, *(_text(row.cells[name], COLUMNS[name]) for row in group.rows)]
+        return
+    yield ["", *(COLUMNS[name].heading + ARROWS[COLUMNS[name].better] for name in shape.columns), SPEEDUP, GAIN]
     section = ""
     for row in group.rows:
         if row.section != section:
             section = row.section
-            yield _markdown_line([f"**{section}**", *[""] * (len(columns) + 2)])
-        yield _markdown_line([row.label, *(_text(row.cells[name], COLUMNS[name]) for name in columns), *_ratios(row)])
-
-
-def _heading(column: str) -> str:
-    return COLUMNS[column].heading + ARROWS[COLUMNS[column].better]
-
-
-def _markdown_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
-    yield _markdown_line(["", *(row.label for row in group.rows)])
-    yield _markdown_line(["---"] * (len(group.rows) + 1))
-    for name in columns:
-        yield _markdown_line([COLUMNS[name].heading, *(_text(row.cells[name], COLUMNS[name]) for row in group.rows)])
+            yield [section]
+        yield [row.label, *(_text(row.cells[name], COLUMNS[name]) for name in shape.columns), *_ratios(row)]
 
 
 def _markdown_line(cells: Sequence[str]) -> str:
@@ -104,6 +100,7 @@ def _number(values: Sequence[float], column: Column) -> str:
 
 
 def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label: str) -> list[str]:
+    """Write groups side by side, in blocks below each other; transposed ones as tables of their own."""
     lines = [
         r"\begin{table*}[t]",
         r"\centering",
@@ -111,66 +108,41 @@ def _latex_table(table: ResultTable, groups: Sequence[Group], title: str, label:
         rf"\label{{tab:{label}}}",
         r"\small",
     ]
-    shape = table.experiment.table
+    shape, width = table.experiment.table, len(table.experiment.table.columns) + 2
     if shape.transposed:
         for group in groups:
-            lines += _latex_transposed(group, shape.columns)
+            lines += _tabular(len(group.rows), [*_latex_lines([group], shape, group.title)])
     else:
-        lines += _latex_blocks(groups, shape.columns)
+        beside = min(GROUPS_BESIDE, len(groups))
+        blocks: list[str] = []
+        for start in range(0, len(groups), beside):
+            block = groups[start : start + beside]
+            titles = [rf"\multicolumn{{{width}}}{{c}}{{\textbf{{{_escaped(group.title)}}}}}" for group in block]
+            rules = [rf"\cmidrule(lr){{{2 + i * width}-{1 + (i + 1) * width}}}" for i in range(len(block))]
+            blocks += [r"\midrule\midrule"] if start else []
+            blocks += [" & ".join(["", *titles]) + r" \\", "".join(rules), *_latex_lines(block, shape)]
+        lines += _tabular(width * beside, blocks)
     notes = dict.fromkeys([_legend(table), *(note for group in groups for note in group.notes)])
     return [*lines, *(rf"\par\footnotesize {_escaped(note)}" for note in notes), r"\end{table*}"]
 
 
-def _latex_blocks(groups: Sequence[Group], columns: Sequence[str]) -> Iterator[str]:
-    """Write groups side by side, in blocks below each other."""
-    width = len(columns) + 2
-    beside = min(GROUPS_BESIDE, len(groups))
-    yield rf"\begin{{tabular}}{{l{('c' * width) * beside}}}"
-    yield r"\toprule"
-    for start in range(0, len(groups), beside):
-        block = groups[start : start + beside]
-        if start:
-            yield r"\midrule\midrule"
-        titles = [rf"\multicolumn{{{width}}}{{c}}{{\textbf{{{_escaped(group.title)}}}}}" for group in block]
-        yield " & ".join(["", *titles]) + r" \\"
-        yield "".join(rf"\cmidrule(lr){{{2 + i * width}-{1 + (i + 1) * width}}}" for i in range(len(block)))
-        headings = [_escaped(_heading(name)) for name in columns]
-        yield " & ".join(["", *[*headings, SPEEDUP, r"$\Delta$PSNR"] * len(block)]) + r" \\"
-        yield r"\midrule"
-        yield from _latex_rows(block, columns, 1 + width * beside)
-    yield r"\bottomrule"
-    yield r"\end{tabular}"
+def _tabular(columns: int, lines: Sequence[str]) -> list[str]:
+    return [rf"\begin{{tabular}}{{l{'c' * columns}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"]
 
 
-def _latex_rows(block: Sequence[Group], columns: Sequence[str], width: int) -> Iterator[str]:
-    by_label = [{row.label: row for row in group.rows} for group in block]
-    rows = {row.label: row for group in block for row in group.rows}
-    section = ""
-    for label, row in rows.items():
-        if row.section != section:
-            section = row.section
-            yield rf"\multicolumn{{{width}}}{{l}}{{\textbf{{{_escaped(section)}}}}} \\"
-        cells = []
-        for found in by_label:
-            own = found.get(label)
-            if own is None:
-                cells += [""] * (len(columns) + 2)
-                continue
-            texts = [*(_text(own.cells[name], COLUMNS[name]) for name in columns), *_ratios(own)]
-            cells += map(_latex_marked, texts)
-        yield " & ".join([_escaped(label), *cells]) + r" \\"
-
-
-def _latex_transposed(group: Group, columns: Sequence[str]) -> Iterator[str]:
-    yield rf"\begin{{tabular}}{{l{'c' * len(group.rows)}}}"
-    yield r"\toprule"
-    yield " & ".join([_escaped(group.title), *(_escaped(row.label) for row in group.rows)]) + r" \\"
+def _latex_lines(block: Sequence[Group], shape: Table, corner: str = "") -> Iterator[str]:
+    """Write groups side by side, which have the same rows."""
+    (_, *header), *rows = (
+        [line[0][0], *(cell for cells in line for cell in cells[1:])]
+        for line in zip(*(_grid(group, shape) for group in block), strict=True)
+    )
+    yield " & ".join(map(_escaped, [corner, *header])) + r" \\"
     yield r"\midrule"
-    for name in columns:
-        cells = [_latex_marked(_text(row.cells[name], COLUMNS[name])) for row in group.rows]
-        yield " & ".join([_escaped(COLUMNS[name].heading), *cells]) + r" \\"
-    yield r"\bottomrule"
-    yield r"\end{tabular}"
+    for label, *cells in rows:
+        if cells:
+            yield " & ".join([_escaped(label), *map(_latex_marked, cells)]) + r" \\"
+        else:
+            yield rf"\multicolumn{{{1 + len(header)}}}{{l}}{{\textbf{{{_escaped(label)}}}}} \\"
 
 
 def _latex_marked(text: str) -> str:
@@ -180,4 +152,5 @@ def _latex_marked(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    return re.sub(r"N_GS|\brho\b|[&%#_${}~^\\↓↑±]", lambda found: TEX.get(found[0], f"\\{found[0]}"), text)
+    special = rf"{re.escape(GAIN)}|N_GS|\brho\b|" + r"[&%#_${}~^\\↓↑±]"
+    return re.sub(special, lambda match: TEX.get(match[0], f"\\{match[0]}"), text)

@@ -11,20 +11,19 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
 import typer
 
+from lapgs_bench.experiments.commands import LAPGS
+from lapgs_bench.experiments.expansion import PlannedRun, RunSpec, SceneSpec
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.store import Job
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.usage import USAGE_ERROR, usage_message
 from lapgs_plugin.errors import LapgsError, MissingExtraError, SceneError, UserInputError
-from lapgs_plugin.experiments.commands import LAPGS
-from lapgs_plugin.experiments.expansion import PlannedRun, RunSpec, SceneSpec
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.store import Job
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.limits import LONGEST_STEM
@@ -33,15 +32,13 @@ from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution, parse_size
 from lapgs_plugin.training.settings import TrainSettings
 
-READS_SCENES = ("OpenImageIO", "pycolmap")
-"""Packages without which no scene can be read."""
 ANY_SIZE = (1 << 20, 1 << 20)
 """Size to check when that of the images is unknown: no image is larger."""
 OWN_ARGUMENTS = ("-m", "--model_path", "-s", "--source_path")
 """Options of a checkout's script that the experiment sets itself: output folder and scene."""
 
-Sizes = Callable[[str], tuple[int, int] | None]
-"""Size of a scene's smallest image at a resolution; None if unknown."""
+Sizes = Callable[[str], tuple[int, int]]
+"""Size of a scene's smallest image at a resolution."""
 
 
 def check_runs(
@@ -73,15 +70,11 @@ def check_runs(
             _check_kinds(spec)
             if (job := by_id.get(spec.run_id)) is not None:
                 _rehearse(job, _Check(spec, sizes.get(spec.scene), here))
-        except MissingExtraError as error:
-            if here:
-                _note(mistakes, keys, str(error))
         except SceneError as error:
             mistakes.add(keys["scene"], str(error))
-        except LapgsError as error:
-            _note(mistakes, keys, str(error))
-        except USAGE_ERROR as error:
-            _note(mistakes, keys, usage_message(error))
+        except (LapgsError, USAGE_ERROR) as error:
+            if here or not isinstance(error, MissingExtraError):
+                _note(mistakes, keys, usage_message(error) if isinstance(error, USAGE_ERROR) else str(error))
 
 
 def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:
@@ -103,7 +96,7 @@ class _Check(Rehearsal):
         from lapgs_plugin.training.planning import check_storage, make_plan, require_pruning
 
         if self.size is not None:
-            require_pruning(make_plan(self.size(reference.resolution) or ANY_SIZE, settings), settings)
+            require_pruning(make_plan(self.size(reference.resolution), settings), settings)
         if self.here or rasterizer != AUTO:  # auto may choose another one elsewhere
             check_storage(settings, training_rasterizer(choose_rasterizer(rasterizer), settings).device)
 
@@ -120,11 +113,7 @@ class _Check(Rehearsal):
 
 
 def _rehearse(job: Job, check: _Check) -> None:
-    """Let the first command of a run check its options.
-
-    Raises:
-        LapgsError, click's UsageError: the command refuses them.
-    """
+    """Let the first command of a run check its options."""
     name, *words = job.steps[0].command[len(LAPGS) :]
     if not check.here and name == "run":
         words = _without_device(words)
@@ -148,29 +137,20 @@ def _command(name: str) -> Any:
 
 
 def _check_kinds(spec: RunSpec) -> None:
-    """Check that flags are true or false and that other options are not.
-
-    Raises:
-        UserInputError: an option has a value of the wrong kind.
-    """
+    """Check that flags are true or false and that other options are not."""
     flags = {
-        p.name: bool(getattr(p, "is_flag", False)) for p in _command("train" if spec.checkout is None else "run").params
+        p.name for p in _command("train" if spec.checkout is None else "run").params if getattr(p, "is_flag", False)
     }
     for name, value in spec.options.items():
-        if flags[name] and not isinstance(value, bool):
-            raise UserInputError(f"--{name.replace('_', '-')} {value}: expected true or false")
-        if isinstance(value, bool) and not flags[name]:
-            raise UserInputError(f"--{name.replace('_', '-')} {str(value).lower()}: expected a number or text")
+        option = f"--{name.replace('_', '-')} {str(value).lower() if isinstance(value, bool) else value}"
+        if isinstance(value, bool) != (name in flags):
+            raise UserInputError(f"{option}: expected {'true or false' if name in flags else 'a number or text'}")
         if isinstance(value, str) and "\0" in value:
-            raise UserInputError(f"--{name.replace('_', '-')} {value}: expected no NUL, which no command line can hold")
+            raise UserInputError(f"{option}: expected no NUL, which no command line can hold")
 
 
 def _check_name(spec: RunSpec) -> None:
-    """Check that the names of a run's files are not too long.
-
-    Raises:
-        UserInputError: the names of its scene and its backbone are too long together.
-    """
+    """Check that the names of a run's files are not too long."""
     if len(spec.run_id) > LONGEST_STEM:
         raise UserInputError(
             f"a run called {spec.run_id:.60}... has {len(spec.run_id)} characters, expected at most {LONGEST_STEM}; "
@@ -179,11 +159,7 @@ def _check_name(spec: RunSpec) -> None:
 
 
 def _check_arguments(spec: RunSpec) -> None:
-    """Refuse arguments of a checkout's script that would change the output folder or the scene.
-
-    Raises:
-        UserInputError: there is one.
-    """
+    """Refuse arguments of a checkout's script that would change the output folder or the scene."""
     for word in spec.arguments:
         if "\0" in word:
             raise UserInputError(f"arguments {word!r}: expected no NUL, which no command line can hold")
@@ -197,16 +173,10 @@ def _sets(arguments: Sequence[str], *options: str) -> bool:
     return any(word == option or word.startswith(f"{option}=") for word in arguments for option in options)
 
 
-def _smallest_size(scene: SceneSpec, folder: Path, resolution: str) -> tuple[int, int] | None:
-    """Return the smallest width and height of a scene's images; None without the packages that read scenes.
-
-    Raises:
-        SceneError: the scene cannot be used.
-    """
+def _smallest_size(scene: SceneSpec, folder: Path, resolution: str) -> tuple[int, int]:
+    """Return the smallest width and height of a scene's images."""
     if scene.sample is not None and not folder.is_dir():
         return parse_resolution(resolution).size_for(*parse_size(scene.sample.size))
-    if any(find_spec(name) is None for name in READS_SCENES):
-        return None
     from lapgs_plugin.scenes.scene import load_cameras, smallest_of
 
     train, test = load_cameras(folder, resolution=resolution, images=scene.images, eval=True)

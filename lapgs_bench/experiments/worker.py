@@ -15,11 +15,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from lapgs_bench.experiments.commands import Step
+from lapgs_bench.experiments.store import LEASE, Claim, ResultStore
 from lapgs_plugin import __version__
 from lapgs_plugin.environment import run_program, versions
 from lapgs_plugin.errors import LapgsError
-from lapgs_plugin.experiments.commands import Step
-from lapgs_plugin.experiments.store import LEASE, Claim, ResultStore
 from lapgs_plugin.files import require_own
 
 RENEW_EVERY = LEASE / 8
@@ -80,13 +80,8 @@ class RunFailedError(LapgsError):
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
-    """Train and evaluate one run.
-
-    Raises:
-        RunStopped: it was killed.
-        LapgsError: it failed.
-    """
-    from lapgs_plugin.experiments.rows import result_row
+    """Train and evaluate one run, and return its row of results."""
+    from lapgs_bench.experiments.rows import result_row
 
     job = claim.job
     folder = Path(job.folder)
@@ -120,11 +115,7 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
 
 
 def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> int:
-    """Run one command and return its exit code; it is killed when this process ends.
-
-    Raises:
-        RunStopped: it was killed.
-    """
+    """Run one command and return its exit code; it is killed when this process ends."""
     log.write(f"$ {' '.join(step.command)}\n".encode())
     log.flush()
     environment = dict(os.environ)
@@ -135,7 +126,7 @@ def _execute(step: Step, log: BinaryIO, store: ResultStore, claim: Claim, slot: 
     environment["PYTHONUNBUFFERED"] = "1"
     cores = ",".join(map(str, slot.cores)) or "-"
     process = subprocess.Popen(
-        [sys.executable, "-m", "lapgs_plugin.experiments.leash", cores, *step.command],
+        [sys.executable, "-m", "lapgs_bench.experiments.leash", cores, *step.command],
         cwd=step.cwd,
         env=environment,
         stdin=subprocess.PIPE,

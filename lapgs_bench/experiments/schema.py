@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from lapgs_bench.experiments.standard import DATASETS, EXPERIMENTS, PRESETS
 from lapgs_plugin.errors import UserInputError, nearest
-from lapgs_plugin.experiments.standard import DATASETS, EXPERIMENTS, PRESETS
 from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 
@@ -309,20 +309,15 @@ def _wrong_value(where: str, problems: list[Any]) -> list[str]:
 
 def _option_problems(experiment: Experiment, option_names: Mapping[str, Set[str]]) -> list[str]:
     """Find options that the command of their runs does not have."""
-    found: dict[str, str] = {}  # by key, so that a mistake that concerns several commands is reported once
-
-    def check(where: str, options: Mapping[str, Any], command: str) -> None:
+    tables = [(f"backbones.{key}", table.options, table.command) for key, table in experiment.backbones.items()]
+    for number, variant in enumerate(experiment.variants):
+        commands = {experiment.backbones[key].command for key in variant.backbones or experiment.backbones}
+        tables += [(f"variants.{number}", variant.options, command) for command in sorted(commands)]
+    problems: dict[str, str] = {}  # by key, so that a mistake that concerns several commands is reported once
+    for where, options, command in tables:
         for name in options.keys() - option_names[command]:
-            key = f"{where}.options.{name}"
-            found.setdefault(
-                key,
-                f"{key} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have or the "
-                f"experiment sets itself; {nearest(name, option_names[command])}",
+            problems[f"{where}.options.{name}"] = (
+                f"{where}.options.{name} = {options[name]!r:.80}: sets {name}, which `lapgs {command}` does not have "
+                f"or the experiment sets itself; {nearest(name, option_names[command])}"
             )
-
-    for key, backbone in experiment.backbones.items():
-        check(f"backbones.{key}", backbone.options, backbone.command)
-        for number, variant in enumerate(experiment.variants):
-            if key in (variant.backbones or [key]):
-                check(f"variants.{number}", variant.options, backbone.command)
-    return [found[key] for key in sorted(found)]
+    return [problems[key] for key in sorted(problems)]

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from rich.markdown import Markdown
 from rich.markup import escape
 
+from lapgs_bench.experiments import exports
+from lapgs_bench.experiments.aggregate import baseline_of, check_table, make_table
+from lapgs_bench.experiments.checks import check_runs
+from lapgs_bench.experiments.commands import Locations
+from lapgs_bench.experiments.execution import LOGS, STORE, execute, make_samples, prepare
+from lapgs_bench.experiments.expansion import PlannedRun, plan_runs, scenes_of
+from lapgs_bench.experiments.launchers import WorkOrder, check_launcher, launch
+from lapgs_bench.experiments.mistakes import Mistakes
+from lapgs_bench.experiments.schema import Experiment, load_experiment
+from lapgs_bench.experiments.settings import BenchSettings, WorkerSettings
+from lapgs_bench.experiments.standard import experiment_file
+from lapgs_bench.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
+from lapgs_bench.experiments.tables import latex, markdown
 from lapgs_plugin import __version__
-from lapgs_plugin.cli.bench_check import READS_SCENES, check_runs
 from lapgs_plugin.cli.output import make_console, say
 from lapgs_plugin.cli.run import run as run_script
 from lapgs_plugin.cli.train import train
@@ -24,18 +35,6 @@ from lapgs_plugin.errors import (
     UserInputError,
     printable_lines,
 )
-from lapgs_plugin.experiments import exports
-from lapgs_plugin.experiments.aggregate import baseline_of, check_table, make_table
-from lapgs_plugin.experiments.commands import Locations
-from lapgs_plugin.experiments.execution import LOGS, STORE, execute, make_samples, prepare
-from lapgs_plugin.experiments.expansion import PlannedRun, plan_runs, scenes_of
-from lapgs_plugin.experiments.launchers import WorkOrder, check_launcher, launch
-from lapgs_plugin.experiments.mistakes import Mistakes
-from lapgs_plugin.experiments.schema import Experiment, load_experiment
-from lapgs_plugin.experiments.settings import BenchSettings, WorkerSettings
-from lapgs_plugin.experiments.standard import experiment_file
-from lapgs_plugin.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
-from lapgs_plugin.experiments.tables import latex, markdown
 from lapgs_plugin.files import is_file, write_text
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.runs.layout import require_place, require_utf8
@@ -94,23 +93,13 @@ def _option_names() -> dict[str, set[str]]:
 
 
 def _measuring(settings: BenchSettings) -> list[str] | None:
-    """Return the options of `lapgs eval`, None without it.
-
-    Raises:
-        UserInputError: a package that reads scenes or a file of weights is missing.
-    """
+    """Return the options of `lapgs eval`, None without it."""
     if not settings.evaluate:
         return None
     weights = settings.lpips_weights or []
     for file in weights:
         if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
-    missing = [name for name in READS_SCENES if find_spec(name) is None]
-    if missing:
-        raise UserInputError(
-            f"{' and '.join(missing)} cannot be imported, and `lapgs eval` needs them to read scenes; install them, or "
-            "use the metrics that training records with --no-eval"
-        )
     return [word for file in weights for word in ("--lpips-weights", str(file.absolute()))]
 
 
@@ -153,11 +142,7 @@ def _summary(record: dict[str, Any]) -> str:
 
 
 def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) -> None:
-    """Write the results, print their table, and report the runs that failed.
-
-    Raises:
-        RunsFailedError: some did.
-    """
+    """Write the results, print their table, and report the runs that failed."""
     path = folder / STORE
     outcomes = {o.run_id: o for o in ResultStore(path).outcomes({run.spec.run_id for run in planned})}
     records = {run_id: o.record for run_id, o in outcomes.items() if o.record is not None}

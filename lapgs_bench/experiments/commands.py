@@ -11,10 +11,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lapgs_bench.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.adapters.info import RASTER_OPTIONS
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.experiments.expansion import RunSpec, SceneSpec
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS
 from lapgs_plugin.runner.settings import RunSettings
@@ -227,11 +227,7 @@ def _as_options(options: Mapping[str, Any]) -> list[str]:
 
 
 def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
-    """Return the value of a 3DGS codebase's -r for one of our resolutions.
-
-    Raises:
-        UserInputError: there is no such value.
-    """
+    """Return the value of a 3DGS codebase's -r for one of our resolutions."""
     text = spec.resolution
     rule = parse_resolution(text)
     if rule.backbone is not None:
@@ -250,13 +246,9 @@ def _backbone_resolution(spec: RunSpec, scene: Path) -> str:
 
 def _first_width(images: Path) -> int:
     """Return the width of a scene's first image, in pixels."""
-    from PIL import Image
+    from lapgs_plugin.scenes.images import image_size, is_photo
 
     for path in sorted(images.rglob("*")):
-        if path.is_file() and path.suffix.lower() in Image.registered_extensions():
-            try:
-                with Image.open(path) as image:
-                    return image.width
-            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-                raise UserInputError(f"{path}: cannot be read as an image ({error}); expected a photo") from error
+        if is_photo(path):
+            return image_size(path)[0]
     raise UserInputError(f"{images} holds no image; expected the photos of a scene")

@@ -8,14 +8,17 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from itertools import product
+from typing import Any, ClassVar, TypeVar
 
+from lapgs_bench.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant
+from lapgs_bench.experiments.settings import Selection
+from lapgs_bench.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.errors import UserInputError, nearest
-from lapgs_plugin.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant
-from lapgs_plugin.experiments.settings import Selection
-from lapgs_plugin.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.hierarchy.plan import DEFAULT_HIERARCHY
 from lapgs_plugin.untrusted import STRICT
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ class RunSpec:
     @cached_property
     def run_id(self) -> str:
         """Name of the run, different for different settings. Variants with equal settings share their runs."""
-        values = {name: value for name, value in asdict(self).items() if name != "sample" or value}  # runs keep names
-        digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
         last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
         words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
@@ -94,8 +96,8 @@ def scenes_of(experiment: Experiment, selection: Selection) -> list[SceneSpec]:
     Raises:
         UserInputError: a selected scene is not in the file.
     """
-    found = [scene for entry in experiment.scenes for scene in _scenes(entry)]
-    return _selected(found, [scene.name for scene in found], selection.scenes, "--scene")
+    scenes = {scene.name: scene for entry in experiment.scenes for scene in _scenes(entry)}
+    return list(_selected(scenes, selection.scenes, "--scene").values())
 
 
 def plan_runs(experiment: Experiment, selection: Selection) -> list[PlannedRun]:
@@ -106,29 +108,22 @@ def plan_runs(experiment: Experiment, selection: Selection) -> list[PlannedRun]:
     Raises:
         UserInputError: a selected name is not in the file.
     """
-    backbones = _selected(
-        list(experiment.backbones.items()), list(experiment.backbones), selection.backbones, "--backbone"
-    )
-    variants = _selected(
-        experiment.variants, [variant.name for variant in experiment.variants], selection.variants, "--variant"
-    )
+    backbones = _selected(experiment.backbones, selection.backbones, "--backbone")
+    variants = _selected({one.name: one for one in experiment.variants}, selection.variants, "--variant")
     pairs = [
         (name, backbone, variant)
-        for variant in variants
-        for name, backbone in backbones
+        for variant in variants.values()
+        for name, backbone in backbones.items()
         if not variant.backbones or name in variant.backbones
     ]
     if not pairs:
         raise UserInputError("no run is left: the selected variants are not for the selected backbones")
     planned: list[PlannedRun] = []
-    rounds = 0
-    for seed in selection.seeds_or(experiment.seeds):
-        for scene in scenes_of(experiment, selection):
-            first = rounds % len(pairs)
-            for name, backbone, variant in (*pairs[first:], *pairs[:first]):
-                spec = _spec(experiment, selection, scene, name, backbone, variant, seed)
-                planned.append(PlannedRun(spec, variant.name))
-            rounds += 1
+    for seed, scene in product(selection.seeds_or(experiment.seeds), scenes_of(experiment, selection)):
+        for name, backbone, variant in pairs:
+            spec = _spec(experiment, selection, scene, name, backbone, variant, seed)
+            planned.append(PlannedRun(spec, variant.name))
+        pairs = [*pairs[1:], pairs[0]]
     return planned
 
 
@@ -184,8 +179,8 @@ def _scenes(entry: Scenes) -> Iterator[SceneSpec]:
         yield SceneSpec(name, entry.dataset, None, None, entry.resolution, images)
 
 
-def _selected(items: Sequence[Any], names: Sequence[str], wanted: Collection[str] | None, option: str) -> list[Any]:
+def _selected(items: Mapping[str, T], wanted: Collection[str] | None, option: str) -> dict[str, T]:
     for name in wanted or ():
-        if name not in names:
-            raise UserInputError(f"{option} {name}: not in the experiment; {nearest(name, set(names))}")
-    return [item for item, name in zip(items, names, strict=True) if wanted is None or name in wanted]
+        if name not in items:
+            raise UserInputError(f"{option} {name}: not in the experiment; {nearest(name, items.keys())}")
+    return {name: item for name, item in items.items() if wanted is None or name in wanted}

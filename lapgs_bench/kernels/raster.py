@@ -6,7 +6,6 @@ turns, so that a change in the machine's load affects all of them. Ratios are of
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -18,13 +17,14 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
+from lapgs_bench.kernels.random_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.environment import installed_version, versions
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.bench_scene import BenchScene, blended_per_pixel, make_scene
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.limits import usable_processors
@@ -176,13 +176,10 @@ def machine() -> dict[str, str | int]:
     """Describe the processor, the cores that this process may use, threads, and versions."""
     return {
         **versions(),
-        "gsplat": installed_version("gsplat") or "not installed",
+        "gsplat": installed_version("gsplat") or "",
         "cores": usable_processors(),
         "threads": torch.get_num_threads(),
     }
-
-
-# -------------------------------------------------------------------------------------------------- contenders
 
 
 class _Contender:
@@ -240,8 +237,7 @@ def _fast(scene: BenchScene) -> _Contender:
 
 def contender_names(dtype: torch.dtype) -> list[str]:
     """Return the contenders that can run here, the fast one first."""
-    has_gsplat = importlib.util.find_spec("gsplat") is not None and dtype == torch.float32
-    return [FAST, ORACLE, *([GSPLAT] if has_gsplat else [])]
+    return [FAST, ORACLE, *([GSPLAT] if dtype == torch.float32 else [])]
 
 
 def _contenders(scene: BenchScene) -> dict[str, _Contender]:
@@ -252,13 +248,10 @@ def _contenders(scene: BenchScene) -> dict[str, _Contender]:
 
     found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if GSPLAT in contender_names(scene.target.dtype):
-        from lapgs_plugin.evaluation.bench_gsplat import GsplatTorchRasterizer
+        from lapgs_bench.kernels.gsplat_on_cpu import GsplatTorchRasterizer
 
         found[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
     return found
-
-
-# ------------------------------------------------------------------------------------------------- measurement
 
 
 def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> list[str]:
@@ -315,37 +308,26 @@ def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
     for _ in range(repeats):
         with _kernel_times() as kernels:
             parts = fast.iteration()
-        blend, blend_backward = kernels["blend"], kernels["blend_backward"]
-        runs.append(
-            {
-                "prepare": parts["forward"] - blend,
-                "blend": blend,
-                "loss": parts["loss"],
-                "blend_back": blend_backward,
-                "project_back": parts["backward"] - blend_backward,
-                "adam": parts["adam"],
-            }
-        )
-    return {name: median(run[name] for run in runs) for name in runs[0]}
+        blend, back = kernels["blend"], kernels["blend_backward"]
+        others = parts["forward"] - blend, parts["backward"] - back
+        runs.append((others[0], blend, parts["loss"], back, others[1], parts["adam"]))
+    names = "prepare", "blend", "loss", "blend_back", "project_back", "adam"
+    return dict(zip(names, map(median, zip(*runs, strict=True)), strict=True))
 
 
 @contextmanager
 def _kernel_times() -> Iterator[dict[str, float]]:
     """Record the milliseconds of each parallel kernel of the fast rasterizer that runs inside, by name."""
     times: dict[str, float] = {}
-    namespace = vars(pipeline)
-    run = namespace["parallel"]
+    run = vars(pipeline)["parallel"]
 
     def timed(kernel: Callable[..., None], *arguments: Any) -> None:
         start = time.perf_counter()
         run(kernel, *arguments)
         times[kernel.__name__] = 1e3 * (time.perf_counter() - start)
 
-    namespace["parallel"] = timed
-    try:
+    with patch.object(pipeline, "parallel", timed):
         yield times
-    finally:
-        namespace["parallel"] = run
 
 
 def peak_memory(case: BenchCase, dtype: torch.dtype) -> int | None:
@@ -358,17 +340,9 @@ def peak_memory(case: BenchCase, dtype: torch.dtype) -> int | None:
 
 
 def _own_peak_memory() -> int | None:
-    status = Path("/proc/self/status")
-    if status.exists():
-        # getrusage would count what the parent had in memory when it started this process.
-        match = re.search(r"VmHWM:\s*(\d+) kB", status.read_text())
-        return None if match is None else int(match[1]) * 1024
-    try:
-        import resource
-    except ImportError:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    status = Path("/proc/self/status")  # getrusage counts the parent's memory, too
+    match = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
+    return None if match is None else int(match[1]) * 1024
 
 
 def _main(name: str, dtype: str) -> None:

@@ -116,7 +116,13 @@ class BenchSettings:
         Raises:
             UserInputError: a value is no NAME=FOLDER, or the home folder of an unknown user.
         """
-        return {name: _folder(name, text) for name, text in _pairs(self.paths, "--path").items()}
+        folders = {}
+        for name, text in _pairs(self.paths, "--path").items():
+            try:
+                folders[name] = Path(text).expanduser()
+            except RuntimeError as error:
+                raise UserInputError(f"--path {name}={text}: no such user; expected a folder") from error
+        return folders
 
 
 def _pairs(texts: Sequence[str] | None, name_of_option: str) -> dict[str, str]:
@@ -127,10 +133,3 @@ def _pairs(texts: Sequence[str] | None, name_of_option: str) -> dict[str, str]:
             raise UserInputError(f"{name_of_option} {text}: expected NAME=VALUE")
         found[name] = value
     return found
-
-
-def _folder(name: str, text: str) -> Path:
-    try:
-        return Path(text).expanduser()
-    except RuntimeError as error:
-        raise UserInputError(f"--path {name}={text}: no such user; expected a folder") from error

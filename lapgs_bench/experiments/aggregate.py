@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
+from lapgs_bench.experiments.expansion import PlannedRun
+from lapgs_bench.experiments.exports import Row
+from lapgs_bench.experiments.schema import Experiment
+from lapgs_bench.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.errors import RunFolderError, UserInputError, nearest
-from lapgs_plugin.experiments.expansion import PlannedRun
-from lapgs_plugin.experiments.exports import Row
-from lapgs_plugin.experiments.schema import Experiment
-from lapgs_plugin.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.untrusted import shortened
 
 LEVELS = "_level_"
@@ -240,12 +240,8 @@ class _GroupBuilder:
         self._experiment, self._paper, self._dataset = experiment, paper, runs[0].spec.dataset
         self._variants = {variant.name: variant for variant in experiment.variants}
         asked = {(run.spec.backbone, run.variant) for run in runs}
-        self._keys: list[RowKey] = [
-            (backbone, variant)
-            for variant in self._variants
-            for backbone in experiment.backbones
-            if (backbone, variant) in asked
-        ]
+        pairs = [(backbone, variant) for variant in self._variants for backbone in experiment.backbones]
+        self._keys: list[RowKey] = [pair for pair in pairs if pair in asked]
         self._scenes = list(dict.fromkeys(run.spec.scene for run in runs))
         self._found: dict[RowKey, dict[int, dict[str, Row]]] = {key: defaultdict(dict) for key in self._keys}
         for run in runs:
@@ -260,9 +256,8 @@ class _GroupBuilder:
 
     def group(self, title: str | None = None) -> Group:
         cells = {key: self._cells(key) for key in self._keys}
-        return Group(
-            title or self._title(), tuple(self._row(key, cells) for key in self._keys), tuple(self._notes(cells))
-        )
+        rows = tuple(self._row(key, cells) for key in self._keys)
+        return Group(title or self._title(), rows, tuple(self._notes(cells)))
 
     def _title(self) -> str:
         if not self._dataset:
@@ -328,11 +323,7 @@ def _cell(seeds: Sequence[Sequence[Row]], column: Column, paper: PaperFigure | N
 
 
 def _value(row: Row, column: Column) -> tuple[float, ...]:
-    """Return a row's figure, or one for each level, coarsest first; empty without one.
-
-    Raises:
-        RunFolderError: a figure is not a number.
-    """
+    """Return a row's figure, or one for each level, coarsest first; empty without one."""
     for source in column.sources:
         if not source.endswith(LEVELS):
             if row.get(source) is not None:

@@ -104,23 +104,16 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
         results[name] = result.detach().clone()
     seconds: dict[str, list[float]] = {name: [] for name in versions}
     wait: Callable[[], object] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-    for _ in range(repeats):
-        for name, version in versions.items():
-            with one_pool() if name == NUMBA else nullcontext():  # as in training
-                wait()
-                start = time.perf_counter()
-                version.run()
-                wait()
-                seconds[name].append(time.perf_counter() - start)
-    medians = {name: median(each) for name, each in seconds.items()}
-    reference = results[TORCH]
-    return [
-        OpTime(
-            op, name, 1e3 * each, medians[TORCH] / each,
-            float((results[name] - reference).abs().max()),
-        )
-        for name, each in medians.items()
-    ]  # fmt: skip
+    for name, version in [*versions.items()] * repeats:
+        with one_pool() if name == NUMBA else nullcontext():  # as in training
+            wait()
+            start = time.perf_counter()
+            version.run()
+            wait()
+            seconds[name].append(time.perf_counter() - start)
+    medians = {name: median(turns) for name, turns in seconds.items()}
+    differences = {name: float((result - results[TORCH]).abs().max()) for name, result in results.items()}
+    return [OpTime(op, name, 1e3 * own, medians[TORCH] / own, differences[name]) for name, own in medians.items()]
 
 
 def _upsample_versions(ours: str, coarse: Tensor, fine: Tensor) -> Versions:

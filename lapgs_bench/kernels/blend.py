@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lapgs_bench.kernels.random_scene import make_scene
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.bench_scene import make_scene
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat import bindings, direct
@@ -149,7 +149,7 @@ def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
     return Kernels(partial(blend_forward, *given, size, shape), backward, parts)
 
 
-def run_case(
+def time_kernels(
     field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: Mapping[str, Shape]
 ) -> Iterator[BlendTime]:
     """Time all kernels for some views of a field, in turns."""
@@ -162,17 +162,16 @@ def run_case(
     for name, one in kernels.items():
         made = one.forward()
         results[name] = made, (made[0], *one.parts(one.backward(made, by_images)))
-    forward: dict[str, list[float]] = {name: [] for name in kernels}
-    backward: dict[str, list[float]] = {name: [] for name in kernels}
-    for _ in range(repeats):
-        for name, one in kernels.items():
-            forward[name].append(_milliseconds(one.forward))
-            backward[name].append(_milliseconds(partial(one.backward, results[name][0], by_images)))
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in kernels}
+    for name, one in [*kernels.items()] * repeats:
+        back = partial(one.backward, results[name][0], by_images)
+        times[name].append((_milliseconds(one.forward), _milliseconds(back)))
     count, expected = len(cameras), results["gsplat"][1]
     for name, (_, found) in results.items():
         pairs = zip(found, expected, strict=True)
         difference = max(float((one - other).abs().max() / other.abs().max()) for one, other in pairs)
-        yield BlendTime(name, median(forward[name]) / count, median(backward[name]) / count, difference)
+        forward, backward = (median(turns) / count for turns in zip(*times[name], strict=True))
+        yield BlendTime(name, forward, backward, difference)
 
 
 def _milliseconds(run: Callable[[], object], calls: int = 5) -> float:

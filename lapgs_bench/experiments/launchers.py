@@ -16,10 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lapgs_bench.experiments.settings import WorkerSettings
+from lapgs_bench.experiments.worker import Slot, work
 from lapgs_plugin.environment import run_program
 from lapgs_plugin.errors import UserInputError, require_extra, typed_line
-from lapgs_plugin.experiments.settings import WorkerSettings
-from lapgs_plugin.experiments.worker import Slot, work
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,64 @@
+"""Run an experiment, or benchmark one part of the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from lapgs_bench.experiments.settings import BenchSettings
+from lapgs_bench.kernels.commands import blend, ops, raster
+from lapgs_plugin.cli.bridge import takes_settings
+
+EXPERIMENT = "run"
+"""The default subcommand: `lapgs bench smoke`."""
+
+
+class _ExperimentByDefault(TyperGroup):
+    """Run `EXPERIMENT` if the first argument is not the name of a subcommand."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help"):
+            args = [EXPERIMENT, *args]
+        return super().parse_args(ctx, args)
+
+
+@takes_settings
+def experiment(
+    experiment: Annotated[
+        Path,
+        typer.Argument(
+            metavar="EXPERIMENT", help="TOML file, or the name of an experiment that comes with lapgs, such as smoke."
+        ),
+    ],
+    settings: BenchSettings,
+) -> None:
+    """Run all scenes, backbones, variants and seeds of EXPERIMENT, and write tables of the results.
+
+    Each run is a process of its own. Repeat the command to continue after Ctrl-C or a crash; finished runs are kept and
+    failed ones are tried again. Several commands can work on one folder at the same time.
+
+    Examples:
+
+        lapgs bench smoke
+
+        lapgs bench split --path mipnerf360=/data/360
+    """
+    from lapgs_bench.experiments.run import run_experiment
+
+    run_experiment(experiment, settings)
+
+
+app = typer.Typer(
+    name="bench",
+    cls=_ExperimentByDefault,
+    help="Run an experiment (lapgs bench EXPERIMENT), or benchmark one part of this package.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command(EXPERIMENT)(experiment)
+app.command("raster")(raster)
+app.command("ops")(ops)
+app.command("blend")(blend)
