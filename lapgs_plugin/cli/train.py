@@ -95,15 +95,15 @@ def train(
         context.obj.train(request)
         return
     with prepare(request, partial(say, stderr=True)) as run:
-        path, config = run.archive.path(RUN_CONFIG), None
+        path, extended = run.archive.path(RUN_CONFIG), None
         if not run.resumes:
             masks = run.archive.manifest.scene.masks
             write_config(path, context, masks=masks, iterations=run.settings.iterations)
         elif run.settings.extended:
-            config = extended_config(path, run.settings)
+            extended = extended_config(path, run.settings)
         _train(run, watcher)
-        if config is not None:
-            write_text(path, config)
+        if extended is not None:
+            write_text(path, extended)
     _finish(out, scene)
 
 

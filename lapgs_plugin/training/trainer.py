@@ -45,7 +45,6 @@ from lapgs_plugin.training.stage_images import StageImages
 from lapgs_plugin.training.stage_progress import StageProgress
 from lapgs_plugin.training.stage_start import first_exposures, first_model, first_poses, joint_fields
 from lapgs_plugin.training.strategies import Strategy
-from lapgs_plugin.training.views import level_views
 from lapgs_plugin.training.warm_up import warm_up
 
 
@@ -244,21 +243,16 @@ class Trainer:
             return joint_fields(prepared, poses, states)
 
         return StageRun(
+            prepared=prepared,
             stage=replace(stage, iterations=schedule.end),
             schedule=schedule,
-            settings=prepared.settings,
-            views=level_views(prepared.scene.train, stage.level),
             images=images.targets,
-            background=torch.zeros(3, device=prepared.device) if stage.signed else prepared.background,
-            extent=prepared.scene.extent,
-            rasterizer=prepared.rasterizer,
             hooks=self._hooks,
             model=model,
             densifier=control_of(self._strategy_of(stage), schedule, prepared.scene.extent),
             coarser=CoarserLevels(images.train_predictions, prepared.settings.joint_from(stage), unfreeze, breakdown),
             exposures=first_exposures(prepared, stage, checkpoint, overhead, self.monitor),
             poses=poses,
-            batches=prepared.batches,
             breakdown=breakdown,
             progress=StageProgress(start_gaussians=len(model)) if before is None else StageProgress.of(before),
             busy=GpuBusy(stage.iterations if prepared.control.gpu_busy else 0),
