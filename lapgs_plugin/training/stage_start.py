@@ -24,102 +24,92 @@ from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import OFF
 
 
-def first_model(prepared: PreparedRun, stage: Stage) -> TrainableField:
+def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
     """Return the field that a stage starts from: its own to be extended, the previous level's or the point cloud's."""
-    archive, settings = prepared.archive, prepared.settings
-    if prepared.record_to_extend(stage) is not None:
-        return prepared.model(archive.field(stage.level))
-    if continues_field(stage, prepared.plan.levels):
+    archive, settings = run.archive, run.settings
+    if run.record_to_extend(stage) is not None:
+        return run.model(archive.field(stage.level))
+    if continues_field(stage, run.plan.levels):
         field = archive.field(stage.level + 1)
-        model = prepared.model(field)
-        model.adopt_moments(_moments(prepared, stage.level + 1, field), torch.arange(len(field)))
+        model = run.model(field)
+        model.adopt_moments(_moments(run, stage.level + 1, field), torch.arange(len(field)))
         return model
     if not stage.signed:
-        return prepared.model(
-            _field_of_points(prepared, stage) if prepared.first_field is None else prepared.first_field
-        )
+        return run.model(_field_of_points(run, stage) if run.first_field is None else run.first_field)
     generator = torch.Generator().manual_seed(settings.seed)
     coarser = archive.field(stage.level + 1)
     field, kept = inherit(coarser, settings.inherit_mode, settings.inherit_ratio, generator, settings.sh_degree)
-    model = prepared.model(field)
+    model = run.model(field)
     if settings.inherit_mode == "full":
-        model.adopt_moments(_moments(prepared, stage.level + 1, coarser), kept)
+        model.adopt_moments(_moments(run, stage.level + 1, coarser), kept)
     return model
 
 
-def _field_of_points(prepared: PreparedRun, stage: Stage) -> GaussianField:
-    scene, settings = prepared.scene, prepared.settings
+def _field_of_points(run: PreparedRun, stage: Stage) -> GaussianField:
+    scene, settings = run.scene, run.settings
     points = field_from_points(scene.points, scene.colors, settings.sh_degree_of(stage.level))
     return settings.densification.options.start(points, len(scene.train))
 
 
-def _moments(prepared: PreparedRun, level: int, field: GaussianField) -> dict[str, Any]:
+def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, Any]:
     """Return Adam's state that the next level inherits from a finished one with its field."""
-    moments = prepared.archive.optimizer_state(level)
-    check_moments(moments, field, prepared.archive.path(f"level_{level}", OPTIMIZER))
+    moments = run.archive.optimizer_state(level)
+    check_moments(moments, field, run.archive.path(f"level_{level}", OPTIMIZER))
     return moments
 
 
-def joint_fields(
-    prepared: PreparedRun, poses: ViewPoses | None, states: dict[int, dict[str, Any]] | None
-) -> JointFields:
+def joint_fields(run: PreparedRun, poses: ViewPoses | None, states: dict[int, dict[str, Any]] | None) -> JointFields:
     """Return the finished fields for joint training, from a checkpoint's `JointFields.state` or the archive."""
 
     def model(level: int) -> TrainableField:
-        return (
-            prepared.model(prepared.archive.field(level)) if states is None else prepared.restored_model(states[level])
-        )
+        return run.model(run.archive.field(level)) if states is None else run.restored_model(states[level])
 
-    views = (*prepared.scene.train, *prepared.scene.test, *prepared.aside)
+    views = (*run.scene.train, *run.scene.test, *run.aside)
     return JointFields(
-        models={level: model(level) for level in prepared.archive.available_levels if level > 0},
+        models={level: model(level) for level in run.archive.available_levels if level > 0},
         cameras={view.name: view.camera for view in views},
-        rasterizer=prepared.rasterizer,
-        background=prepared.background,
-        pyramid=prepared.pyramid,
+        rasterizer=run.rasterizer,
+        background=run.background,
+        pyramid=run.pyramid,
         poses=poses,
     )
 
 
-def first_poses(prepared: PreparedRun, stage: Stage) -> ViewPoses | None:
+def first_poses(run: PreparedRun, stage: Stage) -> ViewPoses | None:
     """Return the corrections of poses that a stage starts with; None if the run does not refine poses."""
-    if not prepared.settings.refine_poses:
+    if not run.settings.refine_poses:
         return None
-    levels, scene, done = (
-        prepared.archive.available_levels,
-        prepared.scene,
-        prepared.plan.iterations_before(stage.level),
-    )
-    start = (prepared.archive.poses(levels[-1]) if levels else None) or {}
-    return ViewPoses.create(scene.train, start, scene.extent, prepared.device, done, prepared.plan.iterations)
+    levels, scene, done = run.archive.available_levels, run.scene, run.plan.iterations_before(stage.level)
+    start = (run.archive.poses(levels[-1]) if levels else None) or {}
+    return ViewPoses.create(scene.train, start, scene.extent, run.device, done, run.plan.iterations)
 
 
 def first_exposures(
-    prepared: PreparedRun, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead, monitor: Monitor
+    run: PreparedRun, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead, monitor: Monitor
 ) -> ViewExposures | None:
     """Return the colour transforms that a stage starts with; None if the run does not compensate exposure."""
-    names, levels = [view.name for view in prepared.scene.train], prepared.archive.available_levels
+    names, levels = [view.name for view in run.scene.train], run.archive.available_levels
     start: Tensor | None
     if levels:
-        archived = prepared.archive.exposure(levels[-1])
+        archived = run.archive.exposure(levels[-1])
         start = None if archived is None else start_from(archived, names)
     elif checkpoint is not None:  # `StageRun.restore` has the values
         start = None if checkpoint.get("exposure") is None else identities(len(names))
     else:
         with overhead.timed("exposure"):
-            start = _measured_exposures(prepared, monitor)
+            start = _measured_exposures(run, monitor)
     if start is None:
         return None
-    done = prepared.plan.iterations_before(stage.level)
-    return ViewExposures.create(names, start, prepared.device, done, prepared.plan.iterations)
+    done = run.plan.iterations_before(stage.level)
+    return ViewExposures.create(names, start, run.device, done, run.plan.iterations)
 
 
-def _measured_exposures(prepared: PreparedRun, monitor: Monitor) -> Tensor | None:
+def _measured_exposures(run: PreparedRun, monitor: Monitor) -> Tensor | None:
     """Return the colour transforms (v, 3, 4) that a run starts with, as --exposure says and the photos differ."""
-    choice = prepared.settings.exposure
-    if choice == OFF or not prepared.supervision.composes:
+    choice = run.settings.exposure
+    if choice == OFF or not run.supervision.composes:
         return None
-    measured = measure_exposure(prepared.scene)
+    measured = measure_exposure(run.scene)
     found, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
     if choice == AUTO and not differ:
         return None
@@ -128,4 +118,4 @@ def _measured_exposures(prepared: PreparedRun, monitor: Monitor) -> Tensor | Non
         if differ
         else f"exposure differs by {found}, hardly at all; each photo gets a colour transform all the same"
     )
-    return from_gains(measured.gains) if differ else identities(len(prepared.scene.train))
+    return from_gains(measured.gains) if differ else identities(len(run.scene.train))

@@ -15,13 +15,13 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.prepared_run import PreparedRun
 
 
-def warm_up(prepared: PreparedRun) -> None:
+def warm_up(run: PreparedRun) -> None:
     """Run every kernel of an iteration once, so that compilation is not measured as training."""
-    settings, rasterizer, device = prepared.settings, prepared.rasterizer, prepared.device
-    residuals = any(stage.signed for stage in prepared.plan)
-    joint = any(settings.joint_from(stage) is not None for stage in prepared.plan)
+    settings, rasterizer, device = run.settings, run.rasterizer, run.device
+    residuals = any(stage.signed for stage in run.plan)
+    joint = any(settings.joint_from(stage) is not None for stage in run.plan)
     blue = torch.tensor([[0.0, 0.0, 1.0]])
-    first = field_from_points(blue * prepared.archive.manifest.scene.unit, blue, settings.sh_degree).to(device)
+    first = field_from_points(blue * run.archive.manifest.scene.unit, blue, settings.sh_degree).to(device)
     model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
     camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
     result = rasterizer(model.field, camera, background=black)
