@@ -65,7 +65,7 @@ def _train(
     **decided: Any,
 ) -> None:
     control = TrainingControl(**{name: options.pop(name) for name in CONTROL & options.keys()})
-    run = PreparedRun.of(scene, settings, archive, placed(rasterizer), control=control, **decided)
+    run = PreparedRun.of(scene, settings, archive, placed(rasterizer), control, **decided)
     Trainer(run, **options).run()
 
 

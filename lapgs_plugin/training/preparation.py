@@ -121,7 +121,7 @@ def _begun(request: TrainRequest, reference: SceneReference, say: Say) -> Iterat
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     with RunArchive.create(out, manifest, request.overwrite) as archive:
-        run = PreparedRun.of(scene, settings, archive, placed, control=request.control)
+        run = PreparedRun.of(scene, settings, archive, placed, request.control)
         _say_what_takes_long(run, say)
         yield run
 
@@ -153,7 +153,7 @@ def _continued(request: TrainRequest, reference: SceneReference, say: Say) -> It
             scene = load_reference(replace(manifest.scene, path=str(scene_folder)), hold=settings.images_on != "disk")
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
-            run = PreparedRun.of(scene, settings, archive, placed, control=request.control, resumes=True)
+            run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True)
         _say_what_takes_long(run, say)
         yield run
 

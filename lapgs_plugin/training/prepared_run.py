@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -49,13 +49,21 @@ class PreparedRun:
     archive: RunArchive
     rasterizer: Rasterizer
     device: torch.device
-    control: TrainingControl = field(default_factory=TrainingControl)
-    resumes: bool = False
-    first_field: GaussianField | None = None
+    control: TrainingControl
+    resumes: bool
+    first_field: GaussianField | None
 
     @classmethod
     def of(
-        cls, scene: Scene, settings: TrainSettings, archive: RunArchive, placed: PlacedRasterizer, **options: Any
+        cls,
+        scene: Scene,
+        settings: TrainSettings,
+        archive: RunArchive,
+        placed: PlacedRasterizer,
+        control: TrainingControl | None = None,
+        *,
+        resumes: bool = False,
+        first_field: GaussianField | None = None,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
 
@@ -64,7 +72,7 @@ class PreparedRun:
             settings: of the run.
             archive: open for writing.
             placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
-            options: further attributes: `control`, `resumes`, `first_field`.
+            control, resumes, first_field: see the attributes; by default the run is new and starts from the points.
 
         Raises:
             UserInputError: as `make_plan`.
@@ -80,7 +88,9 @@ class PreparedRun:
             archive=archive,
             rasterizer=in_unit(placed.rasterizer, archive.manifest.scene.unit),
             device=placed.device,
-            **options,
+            control=control or TrainingControl(),
+            resumes=resumes,
+            first_field=first_field,
         )
 
     @cached_property
