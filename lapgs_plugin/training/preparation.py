@@ -122,7 +122,7 @@ def _begun(request: TrainRequest, reference: SceneReference, say: Say) -> Iterat
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     with RunArchive.create(out, manifest, request.overwrite) as archive:
         run = PreparedRun.of(scene, settings, archive, placed, request.control)
-        _say_what_takes_long(run, say)
+        _say_about_photos(run, say)
         yield run
 
 
@@ -154,7 +154,7 @@ def _continued(request: TrainRequest, reference: SceneReference, say: Say) -> It
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
             run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True)
-        _say_what_takes_long(run, say)
+        _say_about_photos(run, say)
         yield run
 
 
@@ -171,8 +171,8 @@ def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: Tr
             raise UserInputError("--gpu-busy: is measured in whole stages, not when a run is extended; leave it out")
 
 
-def _say_what_takes_long(run: PreparedRun, say: Say) -> None:
-    """Say the share of the pixels inside masks, and whether a CPU will take hours."""
+def _say_about_photos(run: PreparedRun, say: Say) -> None:
+    """Say the share of their pixels inside masks, and whether a CPU takes hours for so many."""
     views = (*run.scene.train, *run.aside, *run.scene.test)
     if any(view.masked for view in views):
         share = share_inside(view.mask for view in views)
