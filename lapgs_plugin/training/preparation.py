@@ -33,6 +33,7 @@ MAY_CHANGE = ("images_on", "prediction_precision")
 logger = logging.getLogger(__name__)
 
 Say = Callable[[str], None]
+"""Receives one line of text for the user."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
 
     Args:
         request: what the user asks for.
-        say: receives lines of text for the user.
+        say: receives what the user should know, such as fewer iterations for few photos.
 
     Raises:
         LapgsError: the request, the scene, the run folder or the machine does not allow the run.
@@ -94,11 +95,11 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     )
     if request.control.log is not None:
         require_tensorboard()
-    return (_continued if request.resume else _begun)(request, reference, say)
+    return (_continued_run if request.resume else _new_run)(request, reference, say)
 
 
 @contextmanager
-def _begun(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
+def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
     """Yield a new run."""
     out, settings = Path(request.out), request.settings
     RunArchive.require_room(out, request.overwrite)
@@ -127,7 +128,7 @@ def _begun(request: TrainRequest, reference: SceneReference, say: Say) -> Iterat
 
 
 @contextmanager
-def _continued(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
+def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
     """Yield the run in a folder, with those settings of `MAY_CHANGE` that were given, or with more iterations."""
     out, scene_folder = Path(request.out), Path(request.scene)
     with one_line_errors(out, "read"):
