@@ -43,13 +43,13 @@ class TrainRequest:
     Attributes:
         scene: the scene folder.
         out: the run folder.
-        settings: of the run. A run that is continued keeps its own, except for those of `given`.
+        settings: of the run. One that is continued keeps its own, but for more iterations and `MAY_CHANGE`.
         photos: how the scene is read.
         control: how the run is executed and observed.
         resume: continue the run in `out`; a finished one is extended if there are more iterations than it has.
         overwrite: replace the run in `out`.
-        given: options, by parameter name, that the user chose: a run that is continued must have the same. Without
-            "iterations", a new run has fewer of them for few photos.
+        given: options that the user chose, by parameter name. A run that is continued must have been started with the
+            same. A new run on few photos gets fewer iterations if they are not among them.
 
     Raises:
         UserInputError: `resume` and `overwrite` contradict each other.
