@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 
 RING = SceneReference("ring", "full", True, (0.0, 0.0, 0.0), "colmap")
 """What manifests say of `ring_scene`."""
+CONTROL = {each.name for each in fields(TrainingControl)}
 
 
 def ring_manifest(settings: TrainSettings, rasterizer: str = "cpu", scene: SceneReference = RING) -> Manifest:
@@ -28,21 +34,39 @@ def make_archive(path: Path, settings: TrainSettings, rasterizer: str = "cpu") -
     return RunArchive.create(path, ring_manifest(settings, rasterizer))
 
 
+def placed(rasterizer: Rasterizer) -> PlacedRasterizer:
+    """Place a rasterizer on the CPU."""
+    return PlacedRasterizer(rasterizer, torch.device("cpu"), {})
+
+
 def train(
     path: Path, scene: Scene, settings: TrainSettings, rasterizer: Rasterizer | None = None, **options: Any
 ) -> RunArchive:
-    """Train a new run; `options` are those of `Trainer`."""
+    """Train a new run; `options` are those of `Trainer` and `TrainingControl`."""
     rasterizer = CpuRasterizer() if rasterizer is None else rasterizer
     with make_archive(path, settings, rasterizer.name) as archive:
-        Trainer(scene, settings, archive, rasterizer, **options).run()
+        _train(scene, settings, archive, rasterizer, options)
     return RunArchive.open(path)
 
 
 def resume(path: Path, scene: Scene, settings: TrainSettings, **options: Any) -> RunArchive:
     """Train a stopped run to its end."""
     with RunArchive.open(path, resume=True) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer(), **options).run(resume=True)
+        _train(scene, settings, archive, CpuRasterizer(), options, resumes=True)
     return RunArchive.open(path)
+
+
+def _train(
+    scene: Scene,
+    settings: TrainSettings,
+    archive: RunArchive,
+    rasterizer: Rasterizer,
+    options: dict[str, Any],
+    **decided: Any,
+) -> None:
+    control = TrainingControl(**{name: options.pop(name) for name in CONTROL & options.keys()})
+    run = PreparedRun.of(scene, settings, archive, placed(rasterizer), control, **decided)
+    Trainer(run, **options).run()
 
 
 def plys(archive: RunArchive) -> list[bytes]:

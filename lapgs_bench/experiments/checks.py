@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -28,9 +28,10 @@ from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings
 from lapgs_plugin.limits import LONGEST_STEM
 from lapgs_plugin.runner.settings import RunSettings
-from lapgs_plugin.runs.manifest import SceneReference
 from lapgs_plugin.scenes.resolution import BACKBONE_PREFIX, parse_resolution, parse_size
-from lapgs_plugin.training.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from lapgs_plugin.training.preparation import TrainRequest
 
 ANY_SIZE = (1 << 20, 1 << 20)
 """Size to check when that of the images is unknown: no image is larger."""
@@ -91,14 +92,15 @@ class _Check(Rehearsal):
     size: Sizes | None  # None: the scene is missing, which is already a mistake
     here: bool
 
-    def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
-        from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
-        from lapgs_plugin.training.planning import check_storage, make_plan, require_pruning
+    def train(self, request: TrainRequest) -> None:
+        from lapgs_plugin.training.backend import training_rasterizer
+        from lapgs_plugin.training.planning import make_plan, require_pruning
 
+        settings, rasterizer = request.settings, request.control.rasterizer
         if self.size is not None:
-            require_pruning(make_plan(self.size(reference.resolution), settings), settings)
+            require_pruning(make_plan(self.size(request.photos.resolution), settings), settings)
         if self.here or rasterizer != AUTO:  # auto may choose another one elsewhere
-            check_storage(settings, training_rasterizer(choose_rasterizer(rasterizer), settings).device)
+            training_rasterizer(rasterizer, settings)
 
     def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
         assert self.size is not None, "commands of a checkout need a scene"

@@ -11,7 +11,6 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import log_to_stderr, say, train_command
-from lapgs_plugin.cli.train import MINUTES_ON_A_CPU, long_on_a_cpu
 from lapgs_plugin.errors import MissingExtraError, counted
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
@@ -61,7 +60,7 @@ def _next_command(out: Path, registered: Sequence[str]) -> str:
     """Return the command that trains the scene, with options for minutes where a CPU would take hours."""
     from lapgs_plugin.scenes.images import image_size
     from lapgs_plugin.scenes.prepare.photos import target_name
-    from lapgs_plugin.training.backend import choose_rasterizer
+    from lapgs_plugin.training.backend import MINUTES_ON_A_CPU, choose_rasterizer, long_on_a_cpu
     from lapgs_plugin.training.settings import TrainSettings
 
     iterations = TrainSettings().for_photos(len(registered)).iterations

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lapgs_plugin.runner.settings import RunSettings
-    from lapgs_plugin.runs.manifest import SceneReference
-    from lapgs_plugin.training.settings import TrainSettings
+    from lapgs_plugin.training.preparation import TrainRequest
 
 
 class Rehearsal:
     """Receive the checked options of a command. With a Rehearsal as its context's object, a command ends there."""
 
-    def train(self, settings: TrainSettings, reference: SceneReference, rasterizer: str) -> None:
-        """Receive the settings of `lapgs train`, the scene and how it is read, and the value of --rasterizer."""
+    def train(self, request: TrainRequest) -> None:
+        """Receive what a command line of `lapgs train` asks for."""
 
     def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
         """Receive the settings of `lapgs run` and the script's own arguments."""

@@ -11,6 +11,11 @@ from lapgs_plugin.rasterizers.choice import RASTERIZERS, PlacedRasterizer, place
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.training.settings import TrainSettings
 
+LONG_ON_A_CPU = 4e9
+"""Pixels to render, over all iterations, from which a CPU takes long."""
+MINUTES_ON_A_CPU = "--resolution 1/4 --iterations 3000"
+"""Options that are proposed there."""
+
 
 def choose_rasterizer(name: str) -> str:
     """Return the rasterizer that `--rasterizer auto` means on this machine; any other name is returned unchanged.
@@ -43,12 +48,17 @@ def choose_rasterizer(name: str) -> str:
 
 
 def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
-    """Return the rasterizer of that name for a run with these settings, and its device.
+    """Return the rasterizer of a run with these settings, and its device.
+
+    Args:
+        name: of the rasterizer, or auto, see `choose_rasterizer`.
+        settings: of the run.
 
     Raises:
-        UserInputError: an unknown name, or settings that it does not honour.
+        UserInputError: an unknown name, settings that it does not honour, or images on a GPU that does not train.
         MissingExtraError: gsplat cannot render on this machine.
     """
+    name = choose_rasterizer(name)
     if name == gsplat.NAME:
         rasterizer = gsplat.GsplatRasterizer(
             antialiasing=settings.antialiased,
@@ -67,4 +77,17 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         raise UserInputError(
             f"{', '.join(needs_gsplat)} with --rasterizer {name}: only gsplat on a CUDA device does that; leave it out"
         )
+    if settings.images_on == "gpu" and placed.device.type != "cuda":
+        raise UserInputError("--images-on gpu: expected memory or disk, as a CPU trains this run")
     return placed
+
+
+def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:
+    """Return what to try where training takes hours on a CPU, else nothing."""
+    width, height = size
+    if iterations * width * height <= LONG_ON_A_CPU:
+        return ""
+    return (
+        f"without a GPU {iterations:,} iterations of {width}x{height} pixels can take hours; "
+        f"{MINUTES_ON_A_CPU} takes minutes"
+    )

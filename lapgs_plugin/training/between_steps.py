@@ -10,9 +10,9 @@ from typing import Any
 from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.runs.watcher import Watcher
-from lapgs_plugin.training.context import RunContext
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.monitor import Tick
+from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
@@ -26,23 +26,22 @@ class BetweenSteps:
     """Do what the last step made due; none of it counts as optimization time.
 
     Attributes:
-        context: of the run.
+        prepared: the run.
         evaluation: of the stage.
+        monitor: shows progress.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
-        test_every, checkpoint_every: as `Trainer` takes them.
         last_tick: seconds and iteration of the last tick, or of the start.
         last_checkpoint: when it was written, or when the stage began, by `time.monotonic`.
     """
 
-    context: RunContext
+    prepared: PreparedRun
     evaluation: StageEvaluation
+    monitor: Monitor
     watcher: Watcher
     stop: StopRequest
     samples: Collection[int]
-    test_every: int | None
-    checkpoint_every: int | None
     last_tick: tuple[float, int]
     last_checkpoint: float = field(default_factory=time.monotonic)
 
@@ -52,15 +51,15 @@ class BetweenSteps:
         Raises:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
-        evaluation, stop = self.evaluation, self.stop
+        evaluation, stop, test_every = self.evaluation, self.stop, self.prepared.control.test_every
         iteration = run.progress.iteration
-        due_test = iteration == run.stage.iterations if self.test_every is None else run.passed(self.test_every)
+        due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self.samples)
-        due_tick = run.passed(max(1, self.context.settings.iterations // LOG_TICKS))
+        due_tick = run.passed(max(1, self.prepared.settings.iterations // LOG_TICKS))
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
-        measured = evaluation.held_out(run, due_test, due_sample and self.test_every is None)
-        if due_sample and self.context.aside:
+        measured = evaluation.held_out(run, due_test, due_sample and test_every is None)
+        if due_sample and self.prepared.aside:
             evaluation.note_best(run)
         if measured or due_tick:
             self._tick(run, measured)
@@ -74,12 +73,12 @@ class BetweenSteps:
         if stop.requested:
             raise TrainingStoppedError(
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
-                f"a checkpoint is in {self.context.archive.path()}, the same command with --resume continues"
+                f"a checkpoint is in {self.prepared.archive.path()}, the same command with --resume continues"
             )
 
     def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self.last_tick
-        archive, progress = self.context.archive, run.progress
+        archive, progress = self.prepared.archive, run.progress
         self.last_tick = (progress.seconds, progress.iteration)
         finished = sum(record.train_seconds for record in archive.manifest.records if record.level != run.stage.level)
         tick = Tick(
@@ -92,11 +91,11 @@ class BetweenSteps:
             **measured,
         )
         archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
-        self.context.monitor.tick(run.stage, tick)
+        self.monitor.tick(run.stage, tick)
 
     def _checkpoint_is_due(self, run: StageRun) -> bool:
-        if self.checkpoint_every is not None:
-            return run.progress.iteration % self.checkpoint_every < run.step_views
+        if (every := self.prepared.control.checkpoint_every) is not None:
+            return run.progress.iteration % every < run.step_views
         return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
 
     def _save_checkpoint(self, run: StageRun) -> None:
@@ -105,5 +104,5 @@ class BetweenSteps:
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}
-            self.context.archive.save_checkpoint(state, extends_to=self.context.settings.iterations)
+            self.prepared.archive.save_checkpoint(state, extends_to=self.prepared.settings.iterations)
         self.last_checkpoint = time.monotonic()

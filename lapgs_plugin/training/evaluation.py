@@ -17,7 +17,8 @@ from lapgs_plugin.ops.composition import add_prediction, to_full_size
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.scenes.scene import View
-from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatch, copied, spread_views
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_images import StageImages
@@ -28,22 +29,24 @@ class StageEvaluation:
     """Measure views of a stage, composed so far and upsampled to full resolution.
 
     Attributes:
-        context: of the run.
+        prepared: the run.
         images: of the stage, with the predictions of the coarser levels.
         overhead: gets the seconds that this takes.
         watch: compares the measurements of all stages.
+        monitor: shows what they say to the user.
         best: the stage's best state so far, see `checkpoint.BestState`; None before the first measurement.
     """
 
-    context: RunContext
+    prepared: PreparedRun
     images: StageImages
     overhead: Overhead
     watch: QualityWatch
+    monitor: Monitor
     best: dict[str, Any] | None = None
 
     def held_out(self, run: StageRun, every: bool, sample: bool) -> dict[str, float]:
         """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
-        test = self.context.scene.test
+        test = self.prepared.scene.test
         some = spread_views(test, SAMPLED_VIEWS) if test and sample else []
         views = test if every else some
         if not views:  # after most steps: reading exposures would wait for the GPU
@@ -65,15 +68,15 @@ class StageEvaluation:
         Args:
             exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
         """
-        level, device, cache = run.stage.level, self.context.device, self.images.test_predictions
+        level, device, cache = run.stage.level, self.prepared.device, self.images.test_predictions
         camera = level_camera(view.camera, level)
         camera = camera if run.poses is None else run.poses.camera(view.name, camera)
-        image = self.context.rasterizer(run.model.field, camera, background=run.background).image
+        image = self.prepared.rasterizer(run.model.field, camera, background=run.background).image
         if (joint := run.coarser.joint) is not None:
             image = add_prediction(image, joint.predict([view.name]))
         elif cache is not None:
             image = add_prediction(image, cache.get(view.name))
-        whole = to_full_size(image, view.camera.size, level, self.context.pyramid)
+        whole = to_full_size(image, view.camera.size, level, self.prepared.pyramid)
         if exposure is not None:
             whole = transform_colors(whole, exposure.to(device))
         photo, mask = view.image.to(device), view.mask
@@ -87,16 +90,16 @@ class StageEvaluation:
         if found is None or not self.watch.falls(level, found, run.progress.loss):
             return
         helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
-        if run.exposures is None and self.context.supervision.composes:
+        if run.exposures is None and self.prepared.supervision.composes:
             helps.insert(0, "--exposure on if brightness or colours of the photos change")
-        self.context.monitor.say(
+        self.monitor.say(
             f"level {level}, iteration {run.progress.iteration}: held-out PSNR fell to {found:.1f} dB from "
             f"{self.watch.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
         )
 
     def note_best(self, run: StageRun) -> None:
         """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
-        aside, iteration = self.context.aside, run.progress.iteration
+        aside, iteration = self.prepared.aside, run.progress.iteration
         last = iteration == run.stage.iterations
         with self.overhead.timed("evaluation"):
             fitted = run.exposures is not None
@@ -106,7 +109,7 @@ class StageEvaluation:
                 parts = {name: copied(state[name]) for name in ("model", "joint", *run.transforms)}
                 self.best = {"psnr": found, "iteration": iteration, **parts}
             if last and self.best["iteration"] < iteration:
-                self.context.monitor.say(
+                self.monitor.say(
                     f"level {run.stage.level}: archives the state after iteration {self.best['iteration']} of "
                     f"{iteration}, {self.best['psnr'] - found:.2f} dB better than the last one on "
                     f"{len(aside)} training views that were set aside"
@@ -117,7 +120,7 @@ class StageEvaluation:
         best = self.best
         if best is None or best["iteration"] == run.stage.iterations:
             return
-        run.model = self.context.restored_model(best["model"])
+        run.model = self.prepared.restored_model(best["model"])
         run.coarser.joint = None
         if best["joint"] is not None:
             run.coarser.restore(best["joint"])

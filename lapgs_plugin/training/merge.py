@@ -28,6 +28,7 @@ from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS
 from lapgs_plugin.training.trainer import Trainer
@@ -92,17 +93,9 @@ def merge_levels(
         placed = training_rasterizer(name, settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
         with RunArchive.create(Path(scratch) / "run", empty) as fitted:
-            trainer = Trainer(
-                scene=teacher,
-                settings=settings,
-                archive=fitted,
-                rasterizer=placed.rasterizer,
-                device=placed.device,
-                monitor=monitor or Monitor(),
-                first_field=start,
-            )
+            run = PreparedRun.of(teacher, settings, fitted, placed, first_field=start)
             try:
-                trainer.run()
+                Trainer(run, monitor=monitor or Monitor()).run()
             except TrainingStoppedError:  # its message offers a checkpoint, which goes with the temporary folder
                 raise TrainingStoppedError(
                     f"the fit to {archive.path()} was stopped and nothing is written; repeat the command to start it "

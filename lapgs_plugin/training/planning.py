@@ -1,8 +1,6 @@
-"""Plan the stages of a run, and check its settings against the photos and the device."""
+"""Plan the stages of a run, and check its settings against the photos."""
 
 from __future__ import annotations
-
-import torch
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
@@ -60,13 +58,3 @@ def require_pruning(plan: StagePlan, settings: TrainSettings) -> None:
             "end before the last iteration; leave --prune out, or change --densify-from, --densify-until or "
             "--iterations"
         )
-
-
-def check_storage(settings: TrainSettings, device: torch.device) -> None:
-    """Check that the device of a run has the place that the settings name for images.
-
-    Raises:
-        UserInputError: it has not.
-    """
-    if settings.images_on == "gpu" and device.type != "cuda":
-        raise UserInputError("--images-on gpu: expected memory or disk, as a CPU trains this run")

@@ -17,7 +17,7 @@ from torch.autograd.grad_mode import set_multithreading_enabled
 from lapgs_plugin.errors import FieldError, TrainingDivergedError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
-from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult
+from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
@@ -32,12 +32,12 @@ from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
-from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.stage_progress import StageProgress
 from lapgs_plugin.training.view_transforms import ViewTransforms
-from lapgs_plugin.training.views import LevelView, view_index
+from lapgs_plugin.training.views import LevelView, level_views, view_index
 
 FINITE_CHECK_EVERY = 100
 """Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
@@ -83,40 +83,33 @@ class StageRun:
     """Train one stage.
 
     Attributes:
-        stage, schedule, settings: of the stage and the run.
-        views: the training views at the stage's level.
-        images: their targets.
-        background: (3,) behind the base; residuals are rendered over zero.
-        extent: scene extent in world units.
+        prepared: the run.
+        stage, schedule: of the stage.
+        images: targets of the training views.
         model: the field, edited in place.
         densifier: density control with its statistics.
         coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
-        batches: whether views of one size are rendered together.
         breakdown: measures the parts of iterations.
         busy: measures the work of the GPU.
         say: shows a line to the user.
         step_views: number of views of the last step.
+        background: (3,) behind the base; residuals are rendered over zero.
 
     The field, the images and the background are on the training device.
     """
 
+    prepared: PreparedRun
     stage: Stage
     schedule: StageSchedule
-    settings: TrainSettings
-    views: Sequence[LevelView]
     images: LevelImages
-    background: Tensor
-    extent: float
-    rasterizer: Rasterizer
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
     coarser: CoarserLevels
     exposures: ViewExposures | None
     poses: ViewPoses | None
-    batches: bool
     breakdown: Breakdown
     busy: GpuBusy
     progress: StageProgress
@@ -127,20 +120,25 @@ class StageRun:
     _following: tuple[range, list[_Planned]] | None = None  # the next step, planned while this one was run
 
     def __post_init__(self) -> None:
-        self._dropout = self.settings.dropout_for(len(self.views))
+        prepared, stage = self.prepared, self.stage
+        settings = self._settings = prepared.settings
+        self._rasterizer = prepared.rasterizer
+        self._views = level_views(prepared.scene.train, stage.level)
+        self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
+        self._dropout = settings.dropout_for(len(self._views))
         # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
-        self._inherits_moments = self.stage.signed and self.settings.inherit_mode == "full"
+        self._inherits_moments = stage.signed and settings.inherit_mode == "full"
         self._losses = ViewLosses(
-            stage=self.stage,
+            stage=stage,
             images=self.images,
             coarser=self.coarser,
             hooks=self.hooks,
-            rasterizer=self.rasterizer,
+            rasterizer=self._rasterizer,
             exposures=self.exposures,
-            ssim_weight=self.settings.ssim_weight,
+            ssim_weight=settings.ssim_weight,
         )
         self._scoring = FieldScoring(
-            self.rasterizer, self.views, self._losses, self.poses, self.background, self.settings.seed, self.breakdown
+            self._rasterizer, self._views, self._losses, self.poses, self.background, settings.seed, self.breakdown
         )
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
@@ -212,7 +210,7 @@ class StageRun:
 
     @property
     def _device(self) -> torch.device:
-        return self.background.device
+        return self.prepared.device
 
     @property
     def _losses_at_once(self) -> int:
@@ -231,7 +229,7 @@ class StageRun:
     def _launches(self, iterations: range) -> list[_Planned]:
         """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
         views = [self._view(iteration) for iteration in iterations]
-        if not self.batches or len(iterations) == 1:
+        if not self.prepared.batches or len(iterations) == 1:
             return [_Planned([iteration], [view]) for iteration, view in zip(iterations, views, strict=True)]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for place, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
@@ -267,7 +265,10 @@ class StageRun:
         if context is not None:
             self.hooks.after_backward(context)
         self.breakdown.mark("optimizer")
-        means_rate, rest = self.schedule.means_learning_rate(last) * self.extent, self.schedule.sh_rest_factor_at(last)
+        means_rate, rest = (
+            self.schedule.means_learning_rate(last) * self.prepared.scene.extent,
+            self.schedule.sh_rest_factor_at(last),
+        )
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
         active = None if self._inherits_moments else (self.schedule.active_sh_degree(last) + 1) ** 2
         self.model.step(means_rate, active, rest, scale)
@@ -366,18 +367,18 @@ class StageRun:
         """Return the image, or images of several cameras, and the whole result if density control needs it."""
         needed, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
         if len(cameras) > 1:
-            result = self.rasterizer.render_batch(
+            result = self._rasterizer.render_batch(
                 gaussians, cameras, background=self.background, sh_degree=degree, describes=needed
             )
             return result.image, result if needed else None
         if needed:
-            result = self.rasterizer(gaussians, cameras[0], background=self.background, sh_degree=degree)
+            result = self._rasterizer(gaussians, cameras[0], background=self.background, sh_degree=degree)
             return result.image, result
-        image = self.rasterizer.render_image(gaussians, cameras[0], background=self.background, sh_degree=degree)
+        image = self._rasterizer.render_image(gaussians, cameras[0], background=self.background, sh_degree=degree)
         return image, None
 
     def _view(self, iteration: int) -> LevelView:
-        return self.views[view_index(iteration, len(self.views), self.settings.seed, self.stage.level)]
+        return self._views[view_index(iteration, len(self._views), self._settings.seed, self.stage.level)]
 
     def _prefetch(self, planned: _Planned) -> None:
         """Copy the images of the next launch to the device while this one renders."""
@@ -393,7 +394,7 @@ class StageRun:
             degree = self.schedule.active_sh_degree(iteration)
             scores = self._scoring.scores(self.model.field.detach(), iteration, degree, threshold)
         changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
-        if (share := self.settings.prune) and iteration == self.schedule.prunes_after:
+        if (share := self._settings.prune) and iteration == self.schedule.prunes_after:
             gone = self._scoring.least_visible(self.model.field.detach(), share)
             remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
             changed = True

@@ -17,7 +17,7 @@ from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.scene import View
-from lapgs_plugin.training.context import RunContext
+from lapgs_plugin.training.prepared_run import PreparedRun
 
 TRAIN, TEST = "train", "test"
 """Folders of cached predictions for training views and for views that are measured."""
@@ -27,7 +27,7 @@ class StageImages:
     """Hold the images of a stage until `close`.
 
     Args:
-        context: of the run.
+        run: the prepared run.
         stage: to train.
         overhead: gets the seconds that images and predictions take.
 
@@ -38,8 +38,8 @@ class StageImages:
         test_predictions: the same for held-out views and those that were set aside.
     """
 
-    def __init__(self, context: RunContext, stage: Stage, overhead: Overhead) -> None:
-        self._context = context
+    def __init__(self, run: PreparedRun, stage: Stage, overhead: Overhead) -> None:
+        self._run = run
         self.train_predictions: UpsampledImages | None = None
         self.test_predictions: UpsampledImages | None = None
         shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
@@ -49,9 +49,9 @@ class StageImages:
             return
         try:
             with overhead.timed("cache"):
-                self.train_predictions = self._predictions(stage, context.scene.train, TRAIN)
+                self.train_predictions = self._predictions(stage, run.scene.train, TRAIN)
             with overhead.timed("evaluation"):
-                self.test_predictions = self._predictions(stage, [*context.scene.test, *context.aside], TEST)
+                self.test_predictions = self._predictions(stage, [*run.scene.test, *run.aside], TEST)
         except BaseException:
             self.close()
             raise
@@ -77,38 +77,36 @@ class StageImages:
 
     @property
     def _folder(self) -> Path:
-        return self._context.archive.path(CACHE)
+        return self._run.archive.path(CACHE)
 
     def _predictions(self, stage: Stage, views: Sequence[View], name: str) -> UpsampledImages:
         """Return Up(I_hat^(l+1)) of each view at its refined pose, for the stage of level l."""
-        context, coarser = self._context, stage.level + 1
-        where = context.settings.images_on
+        run, coarser = self._run, stage.level + 1
+        where = run.settings.images_on
         if where == AUTO and name == TEST:
             where = "memory"  # held-out views are rarely used, outside the clock: a GPU needs its memory for others
-        precision = chosen_precision(context.settings.prediction_precision, context.device)
-        cache = self._stores(views, where).make_upsampled(coarser, precision, name, context.pyramid)
+        precision = chosen_precision(run.settings.prediction_precision, run.device)
+        cache = self._stores(views, where).make_upsampled(coarser, precision, name, run.pyramid)
         if views:
-            renderer = HierarchyRenderer.from_archive(context.archive, context.rasterizer, context.device)
-            for view in refined_views(context.archive, views):
+            renderer = HierarchyRenderer.from_archive(run.archive, run.rasterizer, run.device)
+            for view in refined_views(run.archive, views):
                 camera = level_camera(view.camera, stage.level)
                 cache.put(view.name, renderer.images([view.camera], coarser)[0], (camera.height, camera.width))
         return cache
 
     def _stores(self, views: Sequence[View], where: str = AUTO, eight_bit: bool = False) -> ImageStores:
         sizes = [view.camera.size for view in views]
-        return ImageStores(sizes, self._context.device, eight_bit, where, self._folder)
+        return ImageStores(sizes, self._run.device, eight_bit, where, self._folder)
 
     def _level_images(self, stage: Stage) -> LevelImages:
         """Return the targets of a stage's training views, on a CPU as float32."""
-        context, views = self._context, self._context.scene.train
-        on_gpu = context.device.type == "cuda"
+        run, views = self._run, self._run.scene.train
+        on_gpu = run.device.type == "cuda"
         eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
-        with_coarse = context.supervision.needs_coarse and stage.level < context.plan.levels - 1
-        stores = self._stores(views, context.settings.images_on, eight_bit)
+        with_coarse = run.supervision.needs_coarse and stage.level < run.plan.levels - 1
+        stores = self._stores(views, run.settings.images_on, eight_bit)
         masked = any(view.masked for view in views)
-        images = LevelImages(
-            stores, stage.level, context.pyramid, with_coarse=with_coarse, masked=masked, exact=not on_gpu
-        )
+        images = LevelImages(stores, stage.level, run.pyramid, with_coarse=with_coarse, masked=masked, exact=not on_gpu)
         for view in views:
             images.put(view.name, view.image, view.mask)
         return images

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops import densification_statistics, position_noise, regularization
@@ -13,15 +12,16 @@ from lapgs_plugin.ops.adam import StepScale
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.prepared_run import PreparedRun
 
 
-def warm_up(
-    rasterizer: Rasterizer, settings: TrainSettings, device: torch.device, *, residuals: bool, joint: bool
-) -> None:
+def warm_up(run: PreparedRun) -> None:
     """Run every kernel of an iteration once, so that compilation is not measured as training."""
-    ahead = torch.tensor([[0.0, 0.0, 1.0]])
-    first = field_from_points(ahead, ahead, settings.sh_degree).to(device)
+    settings, rasterizer, device = run.settings, run.rasterizer, run.device
+    residuals = any(stage.signed for stage in run.plan)
+    joint = any(settings.joint_from(stage) is not None for stage in run.plan)
+    blue = torch.tensor([[0.0, 0.0, 1.0]])
+    first = field_from_points(blue * run.archive.manifest.scene.unit, blue, settings.sh_degree).to(device)
     model = TrainableField.create(first, settings.rates, extent=1.0, sparse=settings.sparse_adam)
     camera, black = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4)), torch.zeros(3, device=device)
     result = rasterizer(model.field, camera, background=black)

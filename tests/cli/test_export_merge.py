@@ -25,6 +25,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.training import merge, stage_start, trainer
 from lapgs_plugin.training.merge import FAINT, first_field
+from lapgs_plugin.training.prepared_run import PreparedRun
 from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
 from tests.folders import files_in
@@ -85,8 +86,8 @@ def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, m
     """Its opacities and sizes are right already, and nothing is to shake the positions."""
     found = []
 
-    def capture(**given: Any) -> None:
-        found.append(given["settings"].densification.options)
+    def capture(run: PreparedRun, **_: Any) -> None:
+        found.append(run.settings.densification.options)
         raise UserInputError("far enough")
 
     monkeypatch.setattr(merge, "Trainer", capture)

@@ -16,11 +16,11 @@ import pycolmap
 import pytest
 
 from lapgs_plugin.cli import app
-from lapgs_plugin.cli.train import long_on_a_cpu
 from lapgs_plugin.files import LOCK, MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.training.backend import long_on_a_cpu
 from lapgs_plugin.viewer.preview import read_preview
 from tests.cli.run_folder import write_run, write_scene
 

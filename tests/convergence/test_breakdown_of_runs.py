@@ -17,7 +17,6 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs import gpu_busy
 from lapgs_plugin.runs.profiling import PARTS
-from lapgs_plugin.training import trainer
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.training_runs import Said, StopAt, plys, resume, train
@@ -55,7 +54,6 @@ def test_delays_are_in_their_parts_and_all_parts_are_the_whole(tmp_path: Path, m
         step(*inputs, **options)
 
     monkeypatch.setattr(TrainableField, "step", slow_step)
-    monkeypatch.setattr(trainer, "require_cuda", lambda _: None)
     monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: 0.25)  # stands in for a GPU's profile
     options = {"user_hooks": [SlowHook()], "breakdown": True, "gpu_busy": True, "test_every": 3}
     archive = train(tmp_path / "run", ring_scene(), SETTINGS, SlowRasterizer(), **options)

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import torch
 
-from lapgs_plugin.cli.train import _extended
 from lapgs_plugin.errors import DeviceMemoryError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.files import MANIFEST
@@ -24,6 +23,7 @@ from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import trainer
 from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.preparation import extended_settings
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -59,7 +59,7 @@ def finished(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pyt
 
 def extend(path: Path, scene: Scene, asked: int | None = AFTER, monitor: Monitor | None = None) -> None:
     archive = RunArchive.open(path)
-    settings = _extended(archive, settings_from_manifest(archive.manifest), asked)
+    settings = extended_settings(archive, settings_from_manifest(archive.manifest), asked)
     resume(path, scene, settings, monitor=monitor or Monitor())
 
 

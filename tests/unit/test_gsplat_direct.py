@@ -19,6 +19,7 @@ from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.training.backend import training_rasterizer
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_scene import ring_scene
@@ -206,7 +207,7 @@ def test_a_run_for_several_views_a_step(tmp_path: Path) -> None:
         placed = training_rasterizer("gsplat", settings)
         start = time.perf_counter()
         with RunArchive.create(tmp_path / str(views), manifest) as archive:
-            Trainer(scene, settings, archive, placed.rasterizer, placed.device).run()
+            Trainer(PreparedRun.of(scene, settings, archive, placed)).run()
         found[views] = archive.history()[-1]["psnr"]
         counts = [record.num_gaussians for record in archive.manifest.records]
         print(f"{views} a step: {found[views]:.2f} dB, {counts} Gaussians, {time.perf_counter() - start:.1f} s")

@@ -33,7 +33,6 @@ from lapgs_plugin.training import backend
 from lapgs_plugin.training import model as model_module
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.planning import check_storage
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.stage import StageRun
@@ -93,8 +92,7 @@ def test_options_of_gsplat_are_refused_elsewhere() -> None:
     with pytest.raises(UserInputError, match="--antialiased, --packed with --rasterizer cpu: only gsplat"):
         training_rasterizer("cpu", settings)
     with pytest.raises(UserInputError, match="gpu: expected memory or disk"):
-        check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cpu"))
-    check_storage(replace(SETTINGS, images_on="gpu"), torch.device("cuda"))
+        training_rasterizer("cpu", replace(SETTINGS, images_on="gpu"))
 
 
 def test_settings_survive_the_manifest() -> None:

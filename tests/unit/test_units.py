@@ -33,9 +33,10 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.runs.training_figures import weak_levels
 from lapgs_plugin.scenes.scene import Scene, load_scene
-from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import Said, placed
 from tests.training_scene import HEIGHT, WIDTH, blob_field, ring_camera, ring_scene
 
 BLACK = torch.zeros(3)
@@ -69,22 +70,12 @@ def write_ring(folder: Path, scale: float = 1.0, points: np.ndarray | None = Non
     return folder
 
 
-class Said(Monitor):
-    """Keep the lines that a run says."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.lines.append(text)
-
-
 def train(folder: Path, scene: Scene, **options: Any) -> tuple[RunArchive, list[str]]:
     settings = TrainSettings(**{"iterations": 30, "sh_degree": 1, "exposure": "off", **options})
     manifest = Manifest(SceneReference.of(scene), rasterizer="cpu", **settings.for_manifest())
     said = Said()
     with RunArchive.create(folder, manifest) as archive:
-        Trainer(scene, settings, archive, CpuRasterizer(), monitor=said).run()
+        Trainer(PreparedRun.of(scene, settings, archive, placed(CpuRasterizer())), monitor=said).run()
     return RunArchive.open(folder), said.lines
 
 

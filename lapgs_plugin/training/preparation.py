@@ -1,0 +1,235 @@
+"""Prepare a run of the built-in trainer: decide and check what a user asked for, before anything is written."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
+from lapgs_plugin.files import MANIFEST, one_line_errors
+from lapgs_plugin.options import option_values
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer
+from lapgs_plugin.rendering.run import load_reference, require_same_scene
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.gpu_busy import require_cuda
+from lapgs_plugin.runs.layout import CHECKPOINT, require_place
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.masks import resolve_masks, share_inside
+from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
+from lapgs_plugin.training.planning import make_plan, require_pruning
+from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.saved_settings import settings_from_manifest
+from lapgs_plugin.training.settings import TrainingControl, TrainSettings
+from lapgs_plugin.training.tensorboard import require_tensorboard
+
+MAY_CHANGE = ("images_on", "prediction_precision")
+"""Settings that may change when a run is continued."""
+
+logger = logging.getLogger(__name__)
+
+Say = Callable[[str], None]
+"""Receives one line of text for the user."""
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """Hold what a user asks of a run.
+
+    Attributes:
+        scene: the scene folder.
+        out: the run folder.
+        settings: of the run. One that is continued keeps its own, but for more iterations and `MAY_CHANGE`.
+        photos: how the scene is read.
+        control: how the run is executed and observed.
+        resume: continue the run in `out`; a finished one is extended if there are more iterations than it has.
+        overwrite: replace the run in `out`.
+        given: options that the user chose, by parameter name. A run that is continued must have been started with the
+            same. A new run on few photos gets fewer iterations if they are not among them.
+
+    Raises:
+        UserInputError: `resume` and `overwrite` contradict each other.
+    """
+
+    scene: Path | str
+    out: Path | str
+    settings: TrainSettings = field(default_factory=TrainSettings)
+    photos: SceneOptions = field(default_factory=SceneOptions)
+    control: TrainingControl = field(default_factory=TrainingControl)
+    resume: bool = False
+    overwrite: bool = False
+    given: frozenset[str] = frozenset({"iterations"})
+
+    def __post_init__(self) -> None:
+        if self.resume and self.overwrite:
+            raise UserInputError("--resume and --overwrite contradict each other; give one of them")
+
+
+def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextManager[PreparedRun]:
+    """Yield a run that is ready to train. Its folder is locked for writing inside the block.
+
+    Everything that can be refused without the photos is refused before they are read. The folder of a new run is made
+    last, with its manifest.
+
+    Args:
+        request: what the user asks for.
+        say: receives what the user should know, such as fewer iterations for few photos.
+
+    Raises:
+        LapgsError: the request, the scene, the run folder or the machine does not allow the run.
+    """
+    photos = request.photos
+    masks = resolve_masks(Path(request.scene), photos.masks)
+    reference = SceneReference(
+        path=str(request.scene),
+        resolution=photos.resolution,
+        eval=photos.eval,
+        background=photos.background_color,
+        kind="",
+        images=photos.images,
+        masks=masks,
+    )
+    if request.control.log is not None:
+        require_tensorboard()
+    return (_continued_run if request.resume else _new_run)(request, reference, say)
+
+
+@contextmanager
+def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
+    """Yield a new run."""
+    out, settings = Path(request.out), request.settings
+    RunArchive.require_room(out, request.overwrite)
+    require_place(out)
+    placed = training_rasterizer(request.control.rasterizer, settings)
+    _check_busy(request.control, placed, settings)
+
+    def decide(size: tuple[int, int], photos: int) -> None:
+        nonlocal settings
+        if "iterations" not in request.given and (fewer := settings.for_photos(photos)) != settings:
+            settings = fewer
+            say(
+                f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
+                "over them; more gain little with so few photos, and --iterations asks for another number"
+            )
+        settings = settings.for_size(size)
+        require_pruning(make_plan(size, settings, photos), settings)
+
+    scene = load_reference(reference, decide, hold=settings.images_on != "disk")
+    reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
+    manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
+    with RunArchive.create(out, manifest, request.overwrite) as archive:
+        run = PreparedRun.of(scene, settings, archive, placed, request.control)
+        _say_about_photos(run, say)
+        yield run
+
+
+@contextmanager
+def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
+    """Yield the run in a folder, with those settings of `MAY_CHANGE` that were given, or with more iterations."""
+    out, scene_folder = Path(request.out), Path(request.scene)
+    with one_line_errors(out, "read"):
+        begun = (out / MANIFEST).is_file()
+    if not begun:
+        raise RunFolderError(f"{out} is not a run, so there is nothing to continue; leave --resume out to start one")
+    with RunArchive.open(out, resume=True) as archive:
+        manifest, given = archive.manifest, request.given
+        file = archive.path(MANIFEST)
+        _require_same_folder(out, Path(manifest.scene.path), scene_folder)
+        settings = settings_from_manifest(manifest, str(file))
+        if manifest.complete:
+            asked = request.settings.iterations if "iterations" in given else None
+            settings, given = extended_settings(archive, settings, asked, say), given - {"iterations"}
+        wanted = _options(reference, request.settings, request.control.rasterizer)
+        _require_same(out, given, wanted, _options(manifest.scene, settings, manifest.rasterizer))
+        changed = {name: wanted[name] for name in MAY_CHANGE if name in given}
+        settings = replace(settings, **changed)
+        with nullcontext() if changed else errors_about(file):
+            placed = training_rasterizer(manifest.rasterizer, settings)
+        _check_busy(request.control, placed, settings)
+        with errors_about(file):
+            scene = load_reference(replace(manifest.scene, path=str(scene_folder)), hold=settings.images_on != "disk")
+        require_same_scene(archive, scene_folder, scene.smallest_size)
+        with errors_about(file):
+            run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True)
+        _say_about_photos(run, say)
+        yield run
+
+
+def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:
+    """Return the values that a run's result depends on, by option name."""
+    return {**vars(reference), "rasterizer": rasterizer, **option_values(settings)}
+
+
+def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: TrainSettings) -> None:
+    """Check that the GPU's busy time can be measured if that is asked."""
+    if control.gpu_busy:
+        require_cuda(placed.device)
+        if settings.extended:
+            raise UserInputError("--gpu-busy: is measured in whole stages, not when a run is extended; leave it out")
+
+
+def _say_about_photos(run: PreparedRun, say: Say) -> None:
+    """Say the share of their pixels inside masks, and whether a CPU takes hours for so many."""
+    views = (*run.scene.train, *run.aside, *run.scene.test)
+    if any(view.masked for view in views):
+        share = share_inside(view.mask for view in views)
+        say(f"masks ({run.archive.manifest.scene.masks}): {share:.0%} of the pixels are trained on and measured")
+    size = run.plan[0].image_size
+    if run.device.type == "cpu" and (hint := long_on_a_cpu(size, run.settings.iterations)):
+        say(hint)
+
+
+def _require_same_folder(out: Path, before: Path, scene: Path) -> None:
+    """Refuse another scene than that of the run, which may have been moved."""
+    if before.exists() and scene.exists() and not before.samefile(scene):
+        raise UserInputError(
+            f"{scene}: the run in {out} was started with the scene {before}; give that one to continue it, or start "
+            "again with --overwrite"
+        )
+
+
+def _require_same(out: Path, given: frozenset[str], wanted: dict[str, Any], started_with: dict[str, Any]) -> None:
+    """Refuse given options that are not those of the run."""
+    for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+        if name not in started_with:  # another strategy's
+            raise UserInputError(
+                f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "
+                f"run in {out} was started; leave it out to continue it, or start again with --overwrite"
+            )
+        if wanted[name] != started_with[name]:
+            raise UserInputError(
+                f"--{name.replace('_', '-')} asks for {wanted[name]}, but the run in {out} was started with "
+                f"{started_with[name]}; leave the option out to continue it, or start again with --overwrite"
+            )
+
+
+def extended_settings(
+    archive: RunArchive, settings: TrainSettings, asked: int | None, say: Say = logger.info
+) -> TrainSettings:
+    """Return the settings of a finished run with the iterations to which it is extended, if it is.
+
+    Args:
+        archive: the finished run.
+        settings: of its manifest.
+        asked: iterations of the longer run; None continues an interrupted extension.
+        say: receives a line if the run stays as it is.
+
+    Raises:
+        UserInputError: fewer iterations than it has, or others than those of its interrupted extension.
+    """
+    begun, done, run = archive.extends_to, settings.iterations, archive.path()
+    if asked is not None and begun not in (None, asked):
+        raise UserInputError(
+            f"--iterations {asked}: the run in {run} is being extended to {begun}; leave the option out to continue "
+            f"that, or delete {archive.path(CHECKPOINT)} to extend the finished run anew"
+        )
+    if asked is not None and asked < done:  # a run killed after its last iteration has `asked`
+        raise UserInputError(f"--iterations {asked}: the run in {run} is finished with {done}; give more to extend it")
+    goal = asked or begun or done
+    if goal == done:
+        say(f"{run} is finished with {done:,} iterations; --resume --iterations and a larger number extends it")
+    return replace(settings, iterations=goal, extended=settings.extended + goal - done)

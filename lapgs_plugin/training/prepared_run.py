@@ -1,0 +1,131 @@
+"""Hold a run of the built-in trainer that is ready to train: what was asked for, decided and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
+from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.fields.units import in_unit
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.hierarchy.supervision import SUPERVISIONS, Supervision
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.planning import make_plan
+from lapgs_plugin.training.quality import set_aside
+from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
+
+
+@dataclass(frozen=True)
+class PreparedRun:
+    """Hold what all stages of a run share. `preparation.prepare` makes it from a request, `of` from a scene in memory.
+
+    Attributes:
+        scene: its training views are those that are trained on.
+        aside: training views that were set aside to choose the best state; empty without --keep best.
+        settings: of the run.
+        plan: the stages.
+        archive: the run folder, open for writing; its manifest has the same settings.
+        rasterizer: renders every field, in world units.
+        device: of the rasterizer and of training.
+        control: how the run is executed and observed.
+        resumes: whether the run continues from its checkpoint, or after its last finished level.
+        first_field: the first stage starts from it; None starts from the scene's points.
+    """
+
+    scene: Scene
+    aside: tuple[View, ...]
+    settings: TrainSettings
+    plan: StagePlan
+    archive: RunArchive
+    rasterizer: Rasterizer
+    device: torch.device
+    control: TrainingControl
+    resumes: bool
+    first_field: GaussianField | None
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        settings: TrainSettings,
+        archive: RunArchive,
+        placed: PlacedRasterizer,
+        control: TrainingControl | None = None,
+        *,
+        resumes: bool = False,
+        first_field: GaussianField | None = None,
+    ) -> PreparedRun:
+        """Return the run of a scene in memory.
+
+        Args:
+            scene: with all its training views.
+            settings: of the run.
+            archive: open for writing.
+            placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
+            control, resumes, first_field: see the attributes; by default the run is new and starts from the points.
+
+        Raises:
+            UserInputError: as `make_plan`.
+        """
+        views = scene.train
+        aside = set_aside(views) if settings.keep == BEST else []
+        names = {view.name for view in aside}
+        return cls(
+            scene=replace(scene, train=tuple(view for view in views if view.name not in names)),
+            aside=tuple(aside),
+            settings=settings,
+            plan=make_plan(scene.smallest_size, settings, len(views)),
+            archive=archive,
+            rasterizer=in_unit(placed.rasterizer, archive.manifest.scene.unit),
+            device=placed.device,
+            control=control or TrainingControl(),
+            resumes=resumes,
+            first_field=first_field,
+        )
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """Up and Down between levels, on the run's grid."""
+        return Pyramid(self.settings.grid)
+
+    @property
+    def supervision(self) -> Supervision:
+        """What residuals are trained against."""
+        return SUPERVISIONS[self.settings.supervision]
+
+    @property
+    def background(self) -> Tensor:
+        """(3,) colour behind the base, on the device."""
+        return torch.tensor(self.scene.background).to(self.device)
+
+    @property
+    def batches(self) -> bool:
+        """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
+        return not self.settings.refine_poses and self.rasterizer.can_batch
+
+    def record_to_extend(self, stage: Stage) -> LevelRecord | None:
+        """Return the record of a finished stage that is to train on; None for all others."""
+        done = {record.level: record for record in self.archive.manifest.records}.get(stage.level)
+        whole = stage.iterations + self.settings.extension_of(stage)
+        return done if done is not None and done.iterations < whole else None
+
+    def model(self, field: GaussianField) -> TrainableField:
+        """Return a field ready to be trained on the device, with empty moments."""
+        rates, extent, sparse = self.settings.rates, self.scene.extent, self.settings.sparse_adam
+        return TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
+
+    def restored_model(self, state: dict[str, Any]) -> TrainableField:
+        """Return the model of a `TrainableField.state`, on the device."""
+        model = self.model(field_from_splats(state["params"], state["signed"]))
+        model.restore(state)
+        return model

@@ -1,0 +1,121 @@
+"""A run of the built-in trainer is decided and checked before its folder is made, on the command line and in Python."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.scenes import scene as scene_module
+from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.training import preparation
+from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.preparation import TrainRequest, prepare
+from lapgs_plugin.training.settings import Densification, TrainingControl, TrainSettings
+from lapgs_plugin.training.trainer import Trainer
+from tests.training_runs import StopAt, plys
+
+SHORT = TrainSettings(iterations=20, levels=1, sh_degree=0, exposure="off")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scenes") / "sample"
+    make_sample_scene(path, width=64, height=48, views=16, points=200, progress=False)
+    return path
+
+
+@pytest.fixture
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail if a photo is read."""
+
+    def read(*_: Any, **__: Any) -> None:
+        raise AssertionError("a photo was read")
+
+    monkeypatch.setattr(scene_module, "read_image", read)
+
+
+def trained(request: TrainRequest, monitor: Monitor | None = None) -> RunArchive:
+    with prepare(request) as run:
+        Trainer(run, monitor=monitor or Monitor()).run()
+    return RunArchive.open(request.out)
+
+
+@pytest.mark.usefixtures("unread")
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"settings": replace(SHORT, images_on="gpu")}, "--images-on gpu: expected memory or disk"),
+        ({"settings": replace(SHORT, levels=4)}, "level 3 of 4 would be 8x6 pixels"),
+        ({"settings": replace(SHORT, prune=0.1, densification=Densification(until=20))}, "--prune 0.1: prunes when"),
+        ({"settings": replace(SHORT, packed=True)}, "--packed with --rasterizer cpu"),
+        ({"settings": replace(SHORT, views_per_step="17")}, "--views-per-step 17: the scene has 16 training views"),
+        ({"photos": SceneOptions(masks="gone")}, "--masks gone: no such folder"),
+        ({"photos": SceneOptions(images="gone")}, "gone"),
+        ({"control": TrainingControl(rasterizer="none")}, "--rasterizer none: expected auto, gsplat, cpu"),
+        ({"control": TrainingControl(rasterizer="cpu", gpu_busy=True)}, "--gpu-busy: expected a CUDA device"),
+        ({"resume": True}, "is not a run, so there is nothing to continue"),
+    ],
+)
+def test_what_needs_no_photos_is_refused_before_they_are_read(
+    folder: Path, tmp_path: Path, asked: dict[str, Any], message: str
+) -> None:
+    cpu = {"settings": SHORT, "control": TrainingControl(rasterizer="cpu")}
+    with (
+        pytest.raises(UserInputError, match=re.escape(message)),
+        prepare(TrainRequest(folder, tmp_path / "run", **{**cpu, **asked})),
+    ):
+        pass
+    assert not (tmp_path / "run" / "manifest.json").exists()
+
+
+def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> None:
+    """The request of a run that continues has other defaults; the run keeps its own."""
+    photos = SceneOptions(resolution="1/2", eval=True)
+    first = TrainRequest(folder, tmp_path / "run", replace(SHORT, keep="best", gather=2), photos)
+    whole = trained(replace(first, out=tmp_path / "whole"))
+    with pytest.raises(TrainingStoppedError):
+        trained(first, StopAt(0, 11))
+    again = TrainRequest(folder, tmp_path / "run", TrainSettings(iterations=20), resume=True)
+    with pytest.raises(UserInputError, match=r"--iterations asks for 21, but the run in .* was started with 20"):
+        trained(replace(again, settings=TrainSettings(iterations=21)))
+    with pytest.raises(UserInputError, match=r"--resolution asks for full, but .* was started with 1/2"):
+        trained(replace(again, given=frozenset({"resolution"})))
+    with prepare(again) as run, pytest.raises(RunFolderError, match="is being written by process"), prepare(again):
+        pass
+    assert (run.resumes, run.settings.gather, run.plan[0].image_size) == (True, 2, (32, 24))
+    assert (len(run.scene.train), len(run.aside), len(run.scene.test)) == (12, 2, 2)
+    assert plys(trained(again)) == plys(whole)
+    longer = trained(replace(again, settings=TrainSettings(iterations=24)))
+    assert (longer.manifest.settings["iterations"], longer.manifest.settings["extended"]) == (24, 4)
+
+
+@pytest.mark.parametrize(("given", "iterations"), [(frozenset(), 5000), (frozenset({"iterations"}), 30_000)])
+def test_few_photos_shorten_a_run_whose_iterations_were_not_chosen(
+    folder: Path, tmp_path: Path, given: frozenset[str], iterations: int
+) -> None:
+    said: list[str] = []
+    with prepare(TrainRequest(folder, tmp_path / "run", given=given), said.append) as run:
+        assert run.settings.iterations == run.plan.iterations == iterations
+        assert run.archive.manifest.settings["iterations"] == iterations
+    assert any("16 training photos: 5,000 iterations" in line for line in said) is not bool(given)
+
+
+def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def counted(name: str, settings: TrainSettings) -> Any:
+        made.append(name)
+        return original(name, settings)
+
+    original = preparation.training_rasterizer
+    monkeypatch.setattr(preparation, "training_rasterizer", counted)
+    request = TrainRequest(folder, tmp_path / "run", SHORT, control=TrainingControl(rasterizer="cpu", threads=1))
+    trained(request)
+    assert made == ["cpu"]
