@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from lapgs_plugin.errors import (
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
-from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
+from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_record import StageRecord
@@ -37,8 +39,8 @@ from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
 logger = logging.getLogger(__name__)
 
 
-class ActiveStage:
-    """Run one stage: `load_images`, then `train` or `restore`, then `close`.
+class ActiveStage(RunningStage):
+    """Train a stage, or restore it from the archive, inside of `Stages.run`.
 
     Args:
         context, run, window: the stage, its run, and its place there.
@@ -47,50 +49,61 @@ class ActiveStage:
         before: result of the last of them; None for the base.
 
     Attributes:
-        gaussians: the checkout's model that is trained; None before its scene is made.
         scene_files: folder of the files that the checkout's Scene writes beside a model, for its viewers. They are
             copied once the loop has a scene: some checkouts refuse an output folder that is there before they make it.
+        returned: what the script's call returned, for its main block.
     """
+
+    record: StageRecord
 
     def __init__(
         self,
-        context: RunContext,
+        context: CheckoutRun,
         run: TrainingRun,
         window: StageWindow,
         call: TrainingCall,
         finished: Sequence[FinishedStage],
         before: StageResult | None,
     ) -> None:
-        self._context, self._run, self.window, self._finished = context, run, window, finished
+        self._views = StageViews(context, run, window.stage, call, None if before is None else before.predictions)
+        super().__init__(window.stage, self._views.rendering, StageRecord(context, run.archive, window))
+        self._context, self._run, self.window, self._finished, self._call = context, run, window, finished, call
         self._options, self._adapter, self._archive = context.options, context.adapter, run.archive
-        self.stage = window.stage
-        self._call = call
-        self._views = StageViews(context, run, self.stage, self._call, None if before is None else before.predictions)
         self._model = StageModel(context, run.scene, self.stage, before)
-        self.record = StageRecord(context, run.archive, window)
         self._joint: JointLevels | None = None
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
-        self.gaussians: Any = None
         self.scene_files: Path | None = None
+        self.returned: Any = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
 
-    @property
-    def iteration(self) -> int:
-        """Running iteration, from 1; 0 before the first."""
-        return self.record.iteration
+    @contextmanager
+    def entered(self) -> Iterator[None]:
+        """Hold the level's images inside, and keep a trained field despite an error.
+
+        Raises:
+            DeviceMemoryError: the GPU was full.
+        """
+        try:
+            with self.record.overhead.timed("pyramid"):
+                self._views.load_images()
+            try:
+                yield
+            except Exception as error:
+                self._finish_despite(error)
+                raise
+        except torch.cuda.OutOfMemoryError as error:
+            raise self._out_of_memory(error) from error
+        finally:
+            self._joint = self.gaussians = None
+            self._views.close()
+            if self._context.device.type == "cuda":
+                torch.cuda.empty_cache()
 
     @property
     def has_more(self) -> bool:
-        """Whether the running call has iterations after this one."""
-        return self.record.iteration < self.stage.iterations
-
-    def load_images(self) -> None:
-        """Make the level's images; from now on the checkout renders for this stage."""
-        with self.record.overhead.timed("pyramid"):
-            self._views.load_images()
-        self._context.wrapper.rendering = self._views.rendering
+        return self.iteration < self.stage.iterations
 
     @property
     def resets_opacities(self) -> bool:
@@ -98,7 +111,6 @@ class ActiveStage:
         return self._options.residual_resets or not self.stage.signed
 
     def scene_for(self, gaussians: Any) -> Any:
-        """Return the scene of this stage, and initialise `gaussians` from it."""
         self.gaussians = gaussians
         if self.scene_files is not None:
             folder = Path(self._call.dataset.model_path)
@@ -120,8 +132,7 @@ class ActiveStage:
             self._joint.follow(gaussians, self._options.color_factor)
 
     def iteration_begins(self, gaussians: Any) -> None:
-        """Do everything that comes before the next iteration, and count it: the stage's first is 1."""
-        iteration = self.record.iteration + 1
+        iteration = self.iteration + 1
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
         self._context.parts.breakdown.mark("other")
@@ -136,7 +147,6 @@ class ActiveStage:
             self._train_jointly(gaussians)
         count = len(gaussians._xyz) + self._joint_count
         self.record.count(iteration, count)
-        self._context.hooks.iteration_begins(iteration)
         if self.record.write_progress(count) and self._diverged_at is None:
             self._note_divergence(gaussians, iteration - 1)
 
@@ -148,7 +158,7 @@ class ActiveStage:
         """
         if len(gaussians._xyz) == 0:
             raise TrainingDivergedError(
-                f"pruning left no Gaussian at level {self.stage.level}, iteration {self.record.iteration} of "
+                f"pruning left no Gaussian at level {self.stage.level}, iteration {self.iteration} of "
                 f"{self.stage.iterations}; expected some whose opacity grew: give more --iterations, or options of "
                 f"{self._adapter.info.title} that prune less; finished levels ({self._archived_levels()}) are kept"
             )
@@ -161,11 +171,7 @@ class ActiveStage:
             LapgsError: training left nothing to archive.
         """
         self.begin()
-        try:
-            self._context.returned = self._call.run()
-        except Exception as error:
-            self.finish_despite(error)
-            raise
+        self.returned = self._call.run()
         self.require_trained(self.iteration, self.stage.iterations)
         return self.finish()
 
@@ -173,7 +179,7 @@ class ActiveStage:
         """Announce the stage and start its measurements."""
         self._log_start()
         self.record.start()
-        self._context.hooks.stage_begins(self.stage, self._views.rendering)
+        self._context.hooks.stage_begins(self.stage)
         self._context.watcher.stage_started(self.stage)
 
     def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
@@ -202,9 +208,12 @@ class ActiveStage:
         Raises:
             LapgsError: training left nothing to archive, or NaN or inf.
         """
+        gaussians, self.gaussians = (
+            self.gaussians,
+            None,
+        )  # an error from here on is not one despite which it is archived
         self.record.stop(self._views.bytes_on_device)
         self._context.hooks.stage_ends(self.stage)
-        gaussians, self.gaussians = self.gaussians, None
         field = self._exported(gaussians, self.stage.signed)
         joint = None if self._joint is None else self._joint.fields(self._exported)
         self._require_finite({self.stage.level: field, **(joint or {})})
@@ -219,7 +228,7 @@ class ActiveStage:
         self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
-    def finish_despite(self, error: Exception) -> None:
+    def _finish_despite(self, error: Exception) -> None:
         """Archive the field if a checkout's own error came with the last iteration or later, as of a report."""
         refused = isinstance(error, LapgsError) and not isinstance(error, MissingExtraError)
         if refused or self.gaussians is None or self.iteration < self.stage.iterations:
@@ -236,15 +245,7 @@ class ActiveStage:
         gaussians = self._adapter.model_of(self._run.call, field.to(self._context.device))
         return self._result(gaussians, field, *self._model.load_inherited(self._archive))
 
-    def close(self) -> None:
-        """Drop the stage's images, except the predictions for the next stage."""
-        self._context.wrapper.rendering = None
-        self._joint = self.gaussians = None
-        self._views.close()
-        if self._context.device.type == "cuda":
-            torch.cuda.empty_cache()
-
-    def out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
+    def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
         images = self._views.bytes_on_device
         help_ = "--images-on memory takes them off the GPU" if images else "a larger threshold for densification helps"
@@ -285,7 +286,7 @@ class ActiveStage:
         except FieldError as error:
             seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
             raise TrainingDivergedError(
-                f"training diverged at level {self.stage.level}, iteration {self.record.iteration} of "
+                f"training diverged at level {self.stage.level}, iteration {self.iteration} of "
                 f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
                 "again with lower learning rates, or see whether `lapgs run --off` diverges too"
             ) from error
@@ -318,7 +319,7 @@ class ActiveStage:
         self._joint = JointLevels(self._context, self._run, self._finished, self._views)
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
-        self._views.rendering.accumulated = self._joint
+        self.rendering.accumulated = self._joint
 
     def _evaluate(self, gaussians: Any) -> None:
         """Measure the held-out views of the archived level; a failure costs no more than the measurement."""

@@ -22,6 +22,7 @@ from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.archive import RunArchive
@@ -33,26 +34,24 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass
-class RunContext:
+class CheckoutRun:
     """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
 
     Attributes:
         options: of the hierarchy; once the photos are read, with the defaults for their size.
-        stage: the running stage, or that of the dry run, which answers the replaced symbols; None between stages.
-        returned: what the script's last call of `training` returned, for its main block.
+        stages: hold the running stage, or that of the dry run.
     """
 
     adapter: BackboneAdapter
     options: RunSettings
     device: torch.device
     images: SceneImages
+    stages: Stages
     wrapper: RasterizerWrapper
     hooks: HookCaller
     parts: IterationParts
     watcher: Watcher
     measuring: MeasuringOptions
-    stage: Any = None
-    returned: Any = None
     _told: set[str] = field(default_factory=set)
 
     def warn_of_other_images(self, problem: str) -> None:
@@ -80,11 +79,8 @@ class RunContext:
             gaussians: the checkout's model.
             black: whether the background is black instead of the call's.
         """
-        outer, self.wrapper.rendering = self.wrapper.rendering, rendering
-        try:
+        with self.stages.rendering_as(rendering):
             self.adapter.render(call, view, gaussians, self._backgrounds[call.white_background and not black])
-        finally:
-            self.wrapper.rendering = outer
         image, rendering.captured = rendering.captured, None
         assert image is not None, "a rendering that captures"
         return image

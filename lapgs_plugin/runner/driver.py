@@ -38,7 +38,7 @@ from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.context import FinishedStage, RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.dry_run import DryRun, undisturbed
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
@@ -46,6 +46,7 @@ from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.replacements import StageReplacements
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.stage_pruning import require_pruning
@@ -91,14 +92,15 @@ class HierarchyDriver:
         self._adapter = adapter
         self._resume, self._overwrite = resume, overwrite
         place, measuring = torch.device(device), measuring or MeasuringOptions()
-        parts = IterationParts(place, measuring.breakdown)
-        self._context = RunContext(
+        stages, parts = Stages(), IterationParts(place, measuring.breakdown)
+        self._context = CheckoutRun(
             adapter=adapter,
             options=options,
             device=place,
             images=SceneImages(),
-            wrapper=RasterizerWrapper(parts.mark_render, EarlyVisibility() if options.run_ahead else None),
-            hooks=HookCaller(hooks, options.hooks),
+            stages=stages,
+            wrapper=RasterizerWrapper(stages, parts.mark_render, EarlyVisibility() if options.run_ahead else None),
+            hooks=HookCaller(stages, hooks, options.hooks),
             parts=parts,
             watcher=watcher or Watcher(),
             measuring=measuring,
@@ -126,19 +128,19 @@ class HierarchyDriver:
         ):
             self._adapter.script.run_main()
 
-    def _train(self, call: TrainingCall) -> None:
-        """Train the hierarchy in place of the script's call of `training`."""
+    def _train(self, call: TrainingCall) -> Any:
+        """Train the hierarchy in place of the script's call of `training`, and return what its last call returned."""
         profile = self._adapter.profile
         if len(profile.source.models) > 1:
             with undisturbed(self._context.device):
                 profile.choose_model(type(profile.make_model(call.values)))
         with (
             Attachment(self._replacements.in_training()),
-            counting_steps(profile, lambda: self._context.stage),
+            counting_steps(profile, lambda: self._context.stages.running),
         ):
-            self._train_attached(call)
+            return self._train_attached(call)
 
-    def _train_attached(self, call: TrainingCall) -> None:
+    def _train_attached(self, call: TrainingCall) -> Any:
         """Train the hierarchy while the checkout's symbols are replaced."""
         self._adapter.refuse(call, self._has_residuals)
         require_pruning(call, self._options.prune, self._adapter.profile.model)
@@ -181,9 +183,9 @@ class HierarchyDriver:
                     run = TrainingRun(call, scene, archive, path)
                     self._log_schedule(call)
                     if self._has_residuals:
-                        self._run_stages(run, plan, Path(scratch))
+                        returned = self._run_stages(run, plan, Path(scratch))
                     else:
-                        SingleCall(self._context, run, plan).train(Path(scratch))
+                        returned = SingleCall(self._context, run, plan).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", given, kept)
@@ -193,29 +195,29 @@ class HierarchyDriver:
                     shutil.rmtree(archive.path(CACHE), ignore_errors=True)
         self.folder = folder
         logger.info("run folder: %s; next: `lapgs eval %s`", given, shlex.quote(str(given)))
+        return returned
 
-    def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> None:
-        """Train or restore all stages, each by its own call; `scene_files` holds the files that the Scene wrote."""
+    def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> Any:
+        """Train or restore all stages, each by its own call, and return what the last call returned.
+
+        Args:
+            run, plan: the run.
+            scene_files: folder of the files that the Scene wrote.
+        """
         finished: list[FinishedStage] = []
         before: StageResult | None = None
         for stage in plan:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
             active = ActiveStage(self._context, run, window, call, tuple(finished), before)
-            self._context.stage = active
-            try:
-                active.load_images()
+            with self._context.stages.run(active):
                 if stage.level in run.archive.available_levels:
                     before = active.restore()
                 else:
                     active.scene_files = scene_files
                     before = active.train()
-            except torch.cuda.OutOfMemoryError as error:
-                raise active.out_of_memory(error) from error
-            finally:
-                self._context.stage = None
-                active.close()
             finished.append(FinishedStage(stage, call))
+        return active.returned
 
     def _stage_call(self, run: TrainingRun, window: StageWindow) -> TrainingCall:
         """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""

@@ -35,11 +35,12 @@ from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.archived_values import NESTED_WORKS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.context import CheckoutRun
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
+from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
-from lapgs_plugin.runner.step_clock import CLOCK, steps_positions
+from lapgs_plugin.runner.step_clock import CLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ class DryRun:
     """
 
     def __init__(
-        self, context: RunContext, call: TrainingCall, scene: CheckoutScene, plan: StagePlan, schedule: Schedule
+        self, context: CheckoutRun, call: TrainingCall, scene: CheckoutScene, plan: StagePlan, schedule: Schedule
     ) -> None:
         self._context, self._scene, self._plan, self._schedule = context, scene, plan, schedule
         self._adapter = context.adapter
@@ -157,7 +158,7 @@ class DryRun:
 
     def _iterate(self, stage: _DryStage, works: str) -> None:
         """Run the first iteration of the script's loop."""
-        with self._running(stage), self._step("the first iteration", "one as without lapgs", works):
+        with self._context.stages.run(stage), self._step("the first iteration", "one as without lapgs", works):
             stage.call.run()
         if stage.iteration == 0:
             raise UserInputError(
@@ -175,32 +176,12 @@ class DryRun:
             return
         call = later.applied_to(call)
         try:
-            with self._running(stage_of(call)):
+            with self._context.stages.run(stage_of(call)):
                 call.run()
         except LapgsError:
             raise
         except Exception as error:
             logger.debug("dry run of what begins later (%s): %s", ", ".join(later.notes), typed_line(error))
-
-    @contextmanager
-    def _running(self, stage: _DryStage) -> Iterator[None]:
-        """Let a stage answer the replaced symbols, and leave the loop after its first iteration."""
-
-        def stepped(optimizer: Optimizer, *_: Any) -> None:
-            if stage.iteration == 0 and steps_positions(optimizer, stage.gaussians):
-                raise _Enough  # the loop would run to its end
-
-        self._context.wrapper.rendering = stage.rendering
-        self._context.stage = stage
-        watching = register_optimizer_step_post_hook(stepped)
-        try:
-            yield
-        except _Enough:
-            pass
-        finally:
-            watching.remove()
-            self._context.wrapper.rendering = None
-            self._context.stage = None
 
     def _scratch_call(self, folder: Path) -> TrainingCall:
         """Return the script's call with an output folder of its own, and without reports or checkpoints."""
@@ -377,10 +358,10 @@ class _Enough(BaseException):
     """Leave the script's loop."""
 
 
-class _DryStage:
-    """Answer the replaced symbols for one iteration; see `ActiveStage`."""
+class _DryStage(RunningStage):
+    """Answer the replaced symbols for one iteration."""
 
-    resets_opacities = has_more = True
+    has_more = True
 
     def __init__(
         self,
@@ -389,24 +370,33 @@ class _DryStage:
         stage: Stage,
         make_scene: Callable[[Any], Any],
     ) -> None:
-        self.call, self.rendering, self.stage, self._make_scene = call, rendering, stage, make_scene
-        self.iteration = 0
-        self.record = LoopRecord(torch.device("cpu"))  # what it measures is dropped
-        self.gaussians: Any = None
+        super().__init__(stage, rendering, LoopRecord(torch.device("cpu")))  # what it measures is dropped
+        self.call, self._make_scene = call, make_scene
+
+    @contextmanager
+    def entered(self) -> Iterator[None]:
+        """Leave the loop after its first iteration."""
+
+        def stepped(optimizer: Optimizer, *_: Any) -> None:
+            if self.iteration == 0 and self.is_stepped_by(optimizer):
+                raise _Enough  # the loop would run to its end
+
+        watching = register_optimizer_step_post_hook(stepped)
+        try:
+            yield
+        except _Enough:
+            pass
+        finally:
+            watching.remove()
 
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
         return self._make_scene(gaussians)
 
-    def optimizers_made(self, gaussians: Any) -> None:
-        """Do nothing: there is nothing to inherit."""
-
-    densified = optimizers_made
-
     def iteration_begins(self, gaussians: Any) -> None:
         if self.iteration:
             raise _Enough
-        self.iteration = 1
+        self.record.count(1, len(gaussians._xyz))
 
 
 class _Nothing:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,17 +22,16 @@ from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext, StageHook, entry_point_hooks, hooks_line
 from lapgs_plugin.registry import ALL
+from lapgs_plugin.runner.running_stage import Stages
 
 logger = logging.getLogger(__name__)
-
-if TYPE_CHECKING:
-    from lapgs_plugin.runner.stage_rendering import StageRendering
 
 
 class HookCaller:
     """Call users' hooks; false without hooks, so that a run without them has no overhead.
 
     Args:
+        stages: hold the stage whose images the hooks get.
         hooks: hooks besides those registered by entry point.
         registered: which of those take part, as of `entry_point_hooks`.
 
@@ -40,33 +39,25 @@ class HookCaller:
         UserInputError: a hook is not usable.
     """
 
-    def __init__(self, hooks: Sequence[StageHook] = (), registered: str = ALL) -> None:
+    def __init__(self, stages: Stages, hooks: Sequence[StageHook] = (), registered: str = ALL) -> None:
         found = (*entry_point_hooks(registered), *hooks)
         if (line := hooks_line(registered)) is not None:
             logger.info("%s", line)
-        self._hooks, self._any = HookDispatcher(found), bool(found)
-        self._stage: Stage | None = None
-        self._rendering: StageRendering | None = None
-        self._iteration = 0
+        self._stages, self._hooks, self._any = stages, HookDispatcher(found), bool(found)
         self._context: StageContext | None = None
         self._paused = False
 
     def __bool__(self) -> bool:
         return self._any
 
-    def stage_begins(self, stage: Stage, rendering: StageRendering) -> None:
+    def stage_begins(self, stage: Stage) -> None:
         """Call `on_stage_start`."""
-        self._stage, self._rendering, self._context = stage, rendering, None
-        self._iteration = 1  # loops without a clock begin their first one with its step, after its render
+        self._context = None
         self._hooks.on_stage_start(stage)
 
     def stage_ends(self, stage: Stage) -> None:
         """Call `on_stage_end`."""
         self._hooks.on_stage_end(stage)
-
-    def iteration_begins(self, iteration: int) -> None:
-        """Note the number of the iteration."""
-        self._iteration = iteration
 
     def pausing(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function during which no hook is called for an image.
@@ -107,15 +98,16 @@ class HookCaller:
         return result if added is None else result - added
 
     def _make_context(self, key: str, below: Tensor | None) -> StageContext:
-        assert self._stage is not None
-        assert self._rendering is not None
-        images, accumulated = self._rendering.images, self._rendering.accumulated
+        running = self._stages.running
+        assert running is not None, "hooks get the images of a stage"
+        images, accumulated = running.rendering.images, running.rendering.accumulated
         assert images is not None, "a stage that is trained has targets"
         target, coarse = images.get(key)
         if below is None and accumulated is not None:
             below = accumulated.get(key)
+        iteration = max(1, running.iteration)  # loops without a clock begin the first with its step, after its render
         weight = images.get_weights(key)
-        return StageContext(self._stage, self._iteration, view_name(key), target, below, coarse, weight)
+        return StageContext(running.stage, iteration, view_name(key), target, below, coarse, weight)
 
     def densified(self) -> None:
         """Call `on_densify`."""

@@ -21,7 +21,7 @@ from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
-from lapgs_plugin.runner.context import FinishedStage, RunContext, TrainingRun
+from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 
@@ -57,7 +57,7 @@ class JointLevels:
     where = "gpu"  # nothing has to be copied
 
     def __init__(
-        self, context: RunContext, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews
+        self, context: CheckoutRun, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews
     ) -> None:
         self._context, self._run, self._views = context, run, views
         self._pyramid = Pyramid(context.options.grid)

@@ -22,8 +22,8 @@ from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
-from lapgs_plugin.runner.stage_rendering import StageRendering
 
 
 @dataclass(frozen=True)
@@ -49,20 +49,22 @@ class RasterizerWrapper:
     """Make the replacements of a checkout's renderers, and of its rasterizers' settings, classes and functions.
 
     Args:
+        stages: say how images are rendered.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
         visibility: finds visible Gaussians early; None leaves it to the renderers.
 
     Attributes:
         visibility: as given.
-        rendering: how the running stage is rendered; None leaves every call unchanged.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
 
     def __init__(
-        self, mark: Callable[[str], None] = lambda part: None, visibility: EarlyVisibility | None = None
+        self,
+        stages: Stages,
+        mark: Callable[[str], None] = lambda part: None,
+        visibility: EarlyVisibility | None = None,
     ) -> None:
-        self._mark, self.visibility = mark, visibility
-        self.rendering: StageRendering | None = None
+        self._stages, self._mark, self.visibility = stages, mark, visibility
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
@@ -107,7 +109,7 @@ class RasterizerWrapper:
         def make_settings(*args: Any, **kwargs: Any) -> Any:
             self._mark("forward")
             settings = original(*args, **kwargs)
-            rendering = self.rendering
+            rendering = self._stages.rendering
             if rendering is None:
                 return settings
             if (key := self.running.key) is not None and key in rendering.views:
@@ -119,7 +121,7 @@ class RasterizerWrapper:
     def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = original(*args, **kwargs)
-            if self.rendering is None:
+            if self._stages.rendering is None:
                 return made
             return WrappedRasterizer(made, self._call_now(next(iter((*args, *kwargs.values())), None)))
 
@@ -128,7 +130,7 @@ class RasterizerWrapper:
     def _function(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def rasterize(*args: Any, **kwargs: Any) -> Any:
-            if self.rendering is None:
+            if self._stages.rendering is None:
                 return original(*args, **kwargs)
             inputs = named_inputs(original, args, kwargs)
             settings = next((value for name, value in inputs.items() if "setting" in name), None)
@@ -141,7 +143,7 @@ class RasterizerWrapper:
 
         The image is that of the stage if the rasterizer renders the model's colours.
         """
-        rendering, running = self.rendering, self.running
+        rendering, running = self._stages.rendering, self.running
         assert rendering is not None, "calls outside of stages are left as they are"
 
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:

@@ -29,8 +29,9 @@ from lapgs_plugin.files import BARE_RECORD, MANIFEST, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.stage_rendering import StageRendering
-from lapgs_plugin.runner.step_clock import counting_steps, timing_replacements
+from lapgs_plugin.runner.step_clock import TimedLoop, counting_steps, timing_replacements
 from lapgs_plugin.runs.layout import exists
 
 logger = logging.getLogger(__name__)
@@ -39,23 +40,20 @@ TIMELINE_ENTRIES = 200
 """About how many entries the timeline of a run has."""
 
 
-class BareRunRecorder:
+class BareRunRecorder(TimedLoop):
     """Run a script's main block and measure it.
 
     Args:
         adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
         gpu_busy: profile some iterations; needs a CUDA device.
-
-    Attributes:
-        record: measurements of the loop.
     """
 
     def __init__(self, adapter: BackboneAdapter, device: str, gpu_busy: bool = False) -> None:
+        super().__init__(LoopRecord(torch.device(device)))
         self._adapter, self._device, self._gpu_busy = adapter, torch.device(device), gpu_busy
         self._call: TrainingCall | None = None
         self._scene: Any = None
-        self.record = LoopRecord(self._device)
         self._timeline: list[dict[str, float]] = []
         self._timing = ExitStack()  # begins when the scene has a model, whose class is known then
 
@@ -106,7 +104,7 @@ class BareRunRecorder:
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_scene(*args: Any, **kwargs: Any) -> Any:
             self._scene = original(*args, **kwargs)
-            profile = self._adapter.profile
+            self.gaussians, profile = self._scene.gaussians, self._adapter.profile
             profile.choose_model(type(self.gaussians))
             self._timing.close()
             self._timing.enter_context(Attachment(timing_replacements(profile, lambda: self)))
@@ -116,22 +114,10 @@ class BareRunRecorder:
         return make_scene
 
     @property
-    def iteration(self) -> int:
-        """Running iteration, from 1; 0 before the first."""
-        return self.record.iteration
-
-    @property
-    def gaussians(self) -> Any:
-        """The checkout's model; None before its scene is made."""
-        return None if self._scene is None else self._scene.gaussians
-
-    @property
     def has_more(self) -> bool:
-        """Whether training has iterations after this one."""
         return self._call is not None and self.iteration < self._call.opt.iterations
 
     def iteration_begins(self, gaussians: Any) -> None:
-        """Count an iteration that is about to begin."""
         record, count = self.record, len(gaussians._xyz)
         if self.iteration == 0:
             record.start()
@@ -163,8 +149,7 @@ class BareRunRecorder:
     def _held_out(self, call: TrainingCall) -> dict[str, float]:
         """Return means of PSNR in dB and SSIM over the held-out views, empty without any."""
         background = torch.full((3,), float(call.white_background), device=self._device)
-        wrapper = RasterizerWrapper()
-        wrapper.rendering = rendering = StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
+        stages, rendering = Stages(), StageRendering(signed=False, path=ColorPath.NATIVE, views={}, capture=True)
 
         def rendered(camera: Any) -> tuple[Tensor, Tensor]:
             """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
@@ -172,7 +157,8 @@ class BareRunRecorder:
             assert rendering.captured is not None, "render() rasterizes"
             return rendering.captured, camera.original_image.to(rendering.captured.device)
 
-        with Attachment(wrapper.replacements(self._adapter.profile, "render()")):
+        wrapped = RasterizerWrapper(stages).replacements(self._adapter.profile, "render()")
+        with stages.rendering_as(rendering), Attachment(wrapped):
             return mean_quality(map(rendered, self._scene.getTestCameras()))
 
     def _image_bytes(self) -> int:

@@ -14,11 +14,11 @@ from lapgs_plugin.checkouts.viewer_port import sharing_ports
 from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_ssim
-from lapgs_plugin.runner.active_stage import ActiveStage
-from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.context import CheckoutRun
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
-from lapgs_plugin.runner.step_clock import is_trained, timing_replacements
+from lapgs_plugin.runner.running_stage import RunningStage
+from lapgs_plugin.runner.step_clock import timing_replacements
 
 STATISTICS = "add_densification_stats"
 """Method of the family's models that sums gradients of the Gaussians that a view shows."""
@@ -37,8 +37,8 @@ class StageReplacements:
 
     def __init__(
         self,
-        context: RunContext,
-        train: Callable[[TrainingCall], None],
+        context: CheckoutRun,
+        train: Callable[[TrainingCall], Any],
     ) -> None:
         self._context, self._train = context, train
         self._controlling = False  # whether a method of density control is running
@@ -80,9 +80,8 @@ class StageReplacements:
             *parts.replacements(profile, adapter.info),
         ]
 
-    def _running(self) -> ActiveStage | None:
-        stage: ActiveStage | None = self._context.stage
-        return stage
+    def _running(self) -> RunningStage | None:
+        return self._context.stages.running
 
     def _in_residual(self) -> bool:
         stage = self._running()
@@ -126,8 +125,7 @@ class StageReplacements:
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:
-            self._train(TrainingCall.bind(made, args, kwargs))
-            return self._context.returned
+            return self._train(TrainingCall.bind(made, args, kwargs))
 
         return training
 
@@ -147,7 +145,7 @@ class StageReplacements:
         def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
             if (stage := self._running()) is not None:
-                if is_trained(stage, gaussians):
+                if stage.trains(gaussians):
                     stage.optimizers_made(gaussians)
                 elif stage.stage.signed:
                     raise UserInputError(
@@ -169,7 +167,7 @@ class StageReplacements:
                 result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
-            if outermost and (stage := self._running()) is not None and is_trained(stage, gaussians):
+            if outermost and (stage := self._running()) is not None and stage.trains(gaussians):
                 stage.densified(gaussians)
             return result
 

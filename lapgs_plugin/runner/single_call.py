@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from lapgs_plugin.checkouts.training_call import CHECKPOINTS
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
-from lapgs_plugin.runner.context import RunContext, StageResult, TrainingRun
+from lapgs_plugin.runner.context import CheckoutRun, StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
 
@@ -41,6 +42,7 @@ class NestedStage(ActiveStage):
     def __init__(self, *others: Any, advance: Callable[[Any], ActiveStage]) -> None:
         super().__init__(*others)
         self._advance = advance
+        self._took_over = False
         if self._options.prune and (until := pruning_iteration(self._call)) is not None:
             self._prune_at = until - self.window.start  # the call counts the iterations of the whole run
 
@@ -49,15 +51,27 @@ class NestedStage(ActiveStage):
         return self.stage.level > 0 or super().has_more
 
     def iteration_begins(self, gaussians: Any) -> None:
-        if self.record.iteration == self.stage.iterations and self.stage.level > 0:
+        if self.iteration == self.stage.iterations and self.stage.level > 0:
             self._advance(gaussians).iteration_begins(gaussians)
         else:
             super().iteration_begins(gaussians)
 
     def take_over(self, before: NestedStage, gaussians: Any) -> None:
         """Continue training the model, with the views, of the stage before."""
-        self.gaussians = gaussians
+        self.gaussians, self._took_over = gaussians, True
         self._views.take_over(before._views)
+
+    def _finish_despite(self, error: Exception) -> None:
+        """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
+        if isinstance(error, RuntimeError) and self._took_over and self.iteration <= SOON:
+            logger.warning(
+                "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
+                "views, or what it made of them, from before its loop cannot train nested levels in one call: "
+                "--hierarchy laplacian makes a call for each level",
+                *(self._call.function.__name__, self.iteration, self.stage.level),
+            )
+        if self.stage.level == 0:
+            super()._finish_despite(error)
 
 
 class SingleCall:
@@ -67,84 +81,58 @@ class SingleCall:
         context, run, plan: the run.
     """
 
-    def __init__(self, context: RunContext, run: TrainingRun, plan: StagePlan) -> None:
+    def __init__(self, context: CheckoutRun, run: TrainingRun, plan: StagePlan) -> None:
         self._context, self._run, self._plan = context, run, plan
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
         self._call = run.call.copied()
         self._call.dataset.model_path = str(run.archive.path("level_0"))
-        self._stage: NestedStage | None = None
-        self._advanced = False  # whether this call has trained more than one level
+        self._stage: NestedStage
+        self._running = ExitStack()  # of the stage, which is another one at the end of the call than at its start
 
-    def train(self, scene_files: Path) -> None:
-        """Call the script's `training`; `scene_files` holds the files that the Scene wrote.
+    def train(self, scene_files: Path) -> Any:
+        """Call the script's `training` and return what it returned.
+
+        Args:
+            scene_files: folder of the files that the Scene wrote.
 
         Raises:
             LapgsError: it ended before the finest level, or cannot be continued in the middle.
         """
         if not self._left:
-            return
-        stage = self._stage = self._next(self._restored(self._done[-1]) if self._done else None)
-        try:
-            stage.scene_files = scene_files
-            self._begin(stage)
-            if self._done:
-                self._run_from(stage.window.start)
-            else:
-                self._context.returned = self._call.run()
+            return None
+        self._stage = self._next(self._restored(self._done[-1]) if self._done else None)
+        self._stage.scene_files = scene_files
+        with self._running:
+            self._begin()
+            returned = self._run_from(self._stage.window.start) if self._done else self._call.run()
             level, done = self._stage.stage.level, self._stage.window.start + self._stage.iteration
             self._stage.require_trained(done, self._plan.iterations, ended=level == 0)
             self._stage.finish()
-        except torch.cuda.OutOfMemoryError as error:
-            raise self._stage.out_of_memory(error) from error
-        except Exception as error:
-            if isinstance(error, RuntimeError):
-                self._explain_failure(self._stage)
-            if self._stage.stage.level == 0:
-                self._stage.finish_despite(error)
-            raise
-        finally:
-            self._context.stage = None
-            self._stage.close()
-
-    def _explain_failure(self, stage: NestedStage) -> None:
-        """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
-        done = stage.record.iteration
-        if self._advanced and done <= SOON:
-            logger.warning(
-                "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
-                "views, or what it made of them, from before its loop cannot train nested levels in one call: "
-                "--hierarchy laplacian makes a call for each level",
-                self._call.function.__name__,
-                done,
-                stage.stage.level,
-            )
+        return returned
 
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
         window = self._context.window(self._plan, self._left.pop(0))
         return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
 
-    def _begin(self, stage: NestedStage) -> None:
-        given = self._run.call.opt
-        for name in self._context.adapter.densify_thresholds(given):
-            setattr(self._call.opt, name, getattr(given, name) * stage.window.threshold_factor)
-        self._context.stage = stage
-        stage.load_images()
-        stage.begin()
+    def _begin(self) -> None:
+        own = self._run.call.opt
+        for name in self._context.adapter.densify_thresholds(own):
+            setattr(self._call.opt, name, getattr(own, name) * self._stage.window.threshold_factor)
+        self._running.enter_context(self._context.stages.run(self._stage))
+        self._stage.begin()
 
     def _advance(self, gaussians: Any) -> NestedStage:
         """Archive the level whose iterations are over, and bring the checkout's views to the next one."""
         finished = self._stage
-        assert finished is not None, "an iteration begins inside a stage"
         finished.finish()
-        self._advanced = True
-        stage = self._stage = self._next()
-        stage.take_over(finished, gaussians)
-        finished.close()
-        self._begin(stage)
-        return stage
+        self._stage = self._next()
+        self._stage.take_over(finished, gaussians)
+        self._running.close()
+        self._begin()
+        return self._stage
 
     def _restored(self, stage: Stage) -> StageResult:
         """Return the result of a stage that an earlier process archived."""
@@ -152,7 +140,7 @@ class SingleCall:
         carried, moments = StageModel(self._context, self._run.scene, stage, None).load_inherited(archive)
         return StageResult(archive.field(stage.level), None, carried, moments)
 
-    def _run_from(self, iteration: int) -> None:
+    def _run_from(self, iteration: int) -> Any:
         """Make the call as if it continued from one of the checkout's own checkpoints, written after `iteration`.
 
         Only the number is in the file. The model has its parameters, optimizer state and SH degree already, as from
@@ -176,4 +164,4 @@ class SingleCall:
         with tempfile.TemporaryDirectory(prefix="lapgs-resume-") as folder, Attachment(keeping):
             path = Path(folder, "iteration.pth")
             torch.save(((), iteration), path)
-            self._context.returned = self._call.changed(**dict.fromkeys(takes, str(path))).run()
+            return self._call.changed(**dict.fromkeys(takes, str(path))).run()

@@ -16,7 +16,7 @@ from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.ops.composition import to_full_size
-from lapgs_plugin.runner.context import RunContext, TrainingRun
+from lapgs_plugin.runner.context import CheckoutRun, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
@@ -43,7 +43,7 @@ class StageViews:
 
     def __init__(
         self,
-        context: RunContext,
+        context: CheckoutRun,
         run: TrainingRun,
         stage: Stage,
         call: TrainingCall,
@@ -90,7 +90,7 @@ class StageViews:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
 
         def prefetch(next_view: Callable[[], Any]) -> None:
-            rendering = self._context.wrapper.rendering  # of the running stage: views may outlive this one
+            rendering = self._context.stages.rendering  # of the running stage: views may outlive this one
             if rendering is not None and rendering.prefetches:
                 rendering.prefetch(self._context.images.key(next_view()))
 

@@ -1,8 +1,9 @@
-"""Tell a stage when an iteration of a checkout's loop begins, and leave saving out of its time."""
+"""Tell a training loop of a checkout when an iteration begins, and leave saving out of its time."""
 
 from __future__ import annotations
 
 import ast
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -12,9 +13,51 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, 
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import Profile
+from lapgs_plugin.runner.loop_record import LoopRecord
 
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
+
+
+class TimedLoop(ABC):
+    """Count the iterations of a training loop: of a stage, or of a checkout's own run.
+
+    Args:
+        record: measurements of the loop.
+
+    Attributes:
+        record: as given.
+        gaussians: the checkout's model that is trained; None before its scene is made.
+    """
+
+    def __init__(self, record: LoopRecord) -> None:
+        self.record = record
+        self.gaussians: Any = None
+
+    @property
+    def iteration(self) -> int:
+        """Running iteration, from 1; 0 before the first."""
+        return self.record.iteration
+
+    @property
+    @abstractmethod
+    def has_more(self) -> bool:
+        """Whether the running call of `training` has iterations after this one."""
+
+    @abstractmethod
+    def iteration_begins(self, gaussians: Any) -> None:
+        """Do everything that comes before the next iteration, and count it."""
+
+    def trains(self, gaussians: Any) -> bool:
+        """Return whether a model is the scene's: some forks train more models beside it."""
+        return self.gaussians is None or self.gaussians is gaussians
+
+    def is_stepped_by(self, optimizer: Optimizer) -> bool:
+        """Return whether an optimizer steps the positions of the model."""
+        if self.gaussians is None:
+            return False
+        positions = self.gaussians._xyz
+        return any(parameter is positions for group in optimizer.param_groups for parameter in group["params"])
 
 
 def has_clock(profile: Profile) -> bool:
@@ -42,26 +85,19 @@ def _calls_clock(statement: ast.stmt) -> bool:
     return any(isinstance(node, ast.Attribute) and node.attr == CLOCK for node in ast.walk(statement))
 
 
-def steps_positions(optimizer: Optimizer, gaussians: Any) -> bool:
-    """Return whether an optimizer steps the positions of a checkout's model, which is None before its scene is made."""
-    if gaussians is None:
-        return False
-    return any(each is gaussians._xyz for group in optimizer.param_groups for each in group["params"])
-
-
-def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Replacement]:
-    """Return the replacements by which the running stage, or a recorder, is timed.
+def timing_replacements(profile: Profile, running: Callable[[], TimedLoop | None]) -> list[Replacement]:
+    """Return the replacements by which the running loop is timed.
 
     Args:
         profile: the checkout's.
-        running: returns what runs; None between stages.
+        running: returns the running loop; None between stages.
     """
 
     def make_clock(original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            if (stage := running()) is not None and is_trained(stage, gaussians):
-                stage.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
+            if (loop := running()) is not None and loop.trains(gaussians):
+                loop.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
             return original(gaussians, *args, **kwargs)
 
         return update_learning_rate
@@ -69,9 +105,9 @@ def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Re
     def make_save(original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def save(scene: Any, *args: Any, **kwargs: Any) -> Any:
-            if (stage := running()) is None:
+            if (loop := running()) is None:
                 return original(scene, *args, **kwargs)
-            with stage.record.outside("saving"):
+            with loop.record.outside("saving"):
                 return original(scene, *args, **kwargs)
 
         return save
@@ -83,38 +119,29 @@ def timing_replacements(profile: Profile, running: Callable[[], Any]) -> list[Re
     ]
 
 
-def is_trained(stage: Any, gaussians: Any) -> bool:
-    """Return whether a model is that of the scene, which a stage archives: some forks train more models beside it."""
-    return stage.gaussians is None or stage.gaussians is gaussians
-
-
 @contextmanager
-def counting_steps(profile: Profile, running: Callable[[], Any]) -> Iterator[None]:
-    """Begin an iteration after each step of the running stage's positions, unless the loop calls the method `CLOCK`.
+def counting_steps(profile: Profile, running: Callable[[], TimedLoop | None]) -> Iterator[None]:
+    """Begin an iteration after each step of the running loop's positions, unless the loop calls the method `CLOCK`.
 
     The first begins before the first step. So the loop may leave out the step of the last iteration.
 
     Args:
         profile: the checkout's.
-        running: returns the running stage, that of the dry run, or a recorder; None between stages.
+        running: returns the running loop; None between stages.
     """
     if has_clock(profile):
         yield
         return
 
-    def stage_of(optimizer: Optimizer) -> Any:
-        stage = running()
-        return stage if stage is not None and steps_positions(optimizer, stage.gaussians) else None
-
     def before(optimizer: Optimizer, *_: Any) -> None:
-        stage = stage_of(optimizer)
-        if stage is not None and stage.iteration == 0:
-            stage.iteration_begins(stage.gaussians)
+        loop = running()
+        if loop is not None and loop.iteration == 0 and loop.is_stepped_by(optimizer):
+            loop.iteration_begins(loop.gaussians)
 
     def after(optimizer: Optimizer, *_: Any) -> None:
-        stage = stage_of(optimizer)
-        if stage is not None and stage.has_more:
-            stage.iteration_begins(stage.gaussians)
+        loop = running()
+        if loop is not None and loop.has_more and loop.is_stepped_by(optimizer):
+            loop.iteration_begins(loop.gaussians)
 
     handles = register_optimizer_step_pre_hook(before), register_optimizer_step_post_hook(after)
     try:

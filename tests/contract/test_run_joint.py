@@ -20,8 +20,9 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runner import joint
-from lapgs_plugin.runner.context import RunContext
+from lapgs_plugin.runner.context import CheckoutRun
 from lapgs_plugin.runner.joint import JointLevels
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
@@ -62,8 +63,9 @@ def test_renders_of_one_colour_share_their_background() -> None:
         given.append(background)
         rendering.captured = torch.zeros(3, 2, 2)
 
-    adapter, wrapper, device = SimpleNamespace(render=render), SimpleNamespace(rendering=None), torch.device("cpu")
-    context: Any = RunContext(adapter, None, device, None, wrapper, None, None, None, None)  # type: ignore[arg-type]
+    others: dict[str, Any] = dict.fromkeys(("options", "images", "wrapper", "hooks", "parts", "watcher", "measuring"))
+    adapter: Any = SimpleNamespace(render=render)
+    context: Any = CheckoutRun(adapter=adapter, device=torch.device("cpu"), stages=Stages(), **others)
     for white, black in ((True, False), (False, False), (True, True), (True, False)):
         with torch.inference_mode(not given):
             context.render(rendering, SimpleNamespace(white_background=white), None, None, black=black)

@@ -32,6 +32,7 @@ from lapgs_plugin.hooks import (
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.runner.hook_calls import HookCaller
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.training.settings import TrainSettings
 
@@ -367,7 +368,7 @@ def test_installed_hooks_are_chosen(monkeypatch: pytest.MonkeyPatch, chosen: str
         dispatcher.on_stage_start(BASE)
         assert [call.split()[1] for call in CALLS] == names
         CALLS.clear()
-        assert bool(HookCaller(registered=settings.hooks)) == bool(names)
+        assert bool(HookCaller(Stages(), registered=settings.hooks)) == bool(names)
         assert (hooks_line(settings.hooks) is None) == (not names)
 
 
