@@ -64,7 +64,7 @@ def require_script(path: Path) -> Path:
 def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     """Execute the definitions of a script in a fresh `__main__`, with its arguments in `sys.argv`.
 
-    At the end `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are restored.
+    The script's folder takes the place of the launcher's in `sys.path`, so that both find the same modules. At the end `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are restored.
     The checkout's modules are removed from `sys.modules`: another checkout may have modules of the same names.
 
     Raises:
@@ -76,7 +76,8 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     module.__file__ = str(path)
     before = sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"]
     known = set(sys.modules)
-    sys.argv, sys.path[:0] = [str(path), *arguments], [str(path.parent)]
+    sys.path[: _is_launcher(Path(sys.argv[0]))] = [str(path.parent)]
+    sys.argv = [str(path), *arguments]
     sys.modules["__main__"] = module
     try:
         exec(definitions, module.__dict__)
@@ -86,6 +87,11 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
         for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
             del sys.modules[name]
+
+
+def _is_launcher(program: Path) -> bool:
+    """Return whether Python put the folder of `lapgs`, or of `python -m lapgs_plugin`, first in `sys.path`."""
+    return (program.stem == "lapgs" or program.parent.name == "lapgs_plugin") and not sys.flags.safe_path
 
 
 def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:

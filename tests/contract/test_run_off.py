@@ -126,6 +126,21 @@ def test_process_state_is_that_of_before(scene: Path, tmp_path: Path) -> None:
     assert not {"scene", "arguments", "gaussian_renderer", "utils"} & (set(sys.modules) - modules)
 
 
+@pytest.mark.parametrize("launcher", ["/opt/bin/lapgs", "/opt/lib/lapgs_plugin/__main__.py", "/opt/bin/pytest"])
+def test_a_script_finds_the_modules_that_python_finds(
+    launcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not those beside the launcher; a program that calls us from Python keeps its own."""
+    script = tmp_path / "train.py"
+    script.write_text('if __name__ == "__main__":\n    pass\n')
+    found = ["/opt/bin", "/usr/lib/python"]
+    monkeypatch.setattr(sys, "path", [*found])
+    monkeypatch.setattr(sys, "argv", [launcher, "run", str(script)])
+    with loaded_script(script, []):
+        assert sys.path == [str(tmp_path), *(found if "pytest" in launcher else found[1:])]
+    assert sys.path == found
+
+
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
     """Exit codes and exceptions are passed on."""
     for statement, raised in (("sys.exit(3)", SystemExit), ("1 / 0", ZeroDivisionError)):

@@ -19,6 +19,7 @@ from lapgs_plugin.checkouts.level_views import SceneImages, make_level_view, vie
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.stage_rendering import GREY, StageRendering
 
 WIDTH, HEIGHT = 8, 6
@@ -113,14 +114,15 @@ def rasterize(means: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Ten
     return torch.zeros(1, *size[:2]), rasterizer_settings.bg_color.expand(size) + means.mean()
 
 
-def residual(camera: Camera, key: str, below: Tensor) -> tuple[RasterizerWrapper, Any, Any]:
-    """Return a wrapper of a residual's stage with its replacements of `Settings` and `rasterize`."""
-    wrapper = RasterizerWrapper()
+def residual(camera: Camera, key: str, below: Tensor) -> tuple[Stages, RasterizerWrapper, Any, Any]:
+    """Return a slot with a residual's stage, and a wrapper with its replacements of `Settings` and `rasterize`."""
     store = SimpleNamespace(get=lambda _: below, prefetch=lambda _: None)
-    wrapper.rendering = StageRendering(
-        True, ColorPath.NATIVE, {key: camera}, accumulated=store, composed=frozenset({key})
-    )
-    return wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
+    views = {key: camera}
+    rendering = StageRendering(True, ColorPath.NATIVE, views, accumulated=store, composed=frozenset(views))
+    stages: Any = Stages()
+    stages.running = SimpleNamespace(rendering=rendering)
+    wrapper = RasterizerWrapper(stages)
+    return stages, wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
 
 
 def colored(means: Tensor, colors: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
@@ -133,10 +135,10 @@ def colored(means: Tensor, colors: Tensor, rasterizer_settings: Settings) -> tup
 def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool) -> None:
     """As an image of features, masks or scores, that a loop compares with something else than the photo."""
     camera, images = made()
-    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    assert wrapper.rendering is not None
-    wrapper.rendering.signed = signed
-    wrapper.rendering.on_image = lambda key, image, below: image + 1
+    stages, wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    rendering: Any = stages.rendering
+    rendering.signed = signed
+    rendering.on_image = lambda key, image, below: image + 1
     function = wrapper._function(colored)
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
     means, own = torch.zeros(2, 3, requires_grad=True), torch.full((2, 3), 0.125)
@@ -167,9 +169,9 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
 def test_maps_beside_a_residuals_image_are_not_trained_on(signed: bool) -> None:
     """As gaussian-grouping's features, RaDe-GS's normals: outputs of the call that renders the image."""
     camera, images = made()
-    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    assert wrapper.rendering is not None
-    wrapper.rendering.signed = signed
+    stages, wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    rendering: Any = stages.rendering
+    rendering.signed = signed
     means = torch.zeros(2, 3, requires_grad=True)
 
     def forward(means: Tensor, shs: Tensor, rasterizer_settings: Settings) -> dict[str, Tensor]:
@@ -200,9 +202,9 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
 ) -> None:
     """As GaussianPro's opacities: the colours are made inside of the renderer."""
     camera, images = made()
-    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    assert wrapper.rendering is not None
-    wrapper.rendering.capture = True
+    stages, wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    rendering: Any = stages.rendering
+    rendering.capture = True
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
 
     def forward(means: Tensor, shs: Tensor | None, colors_precomp: Tensor | None, rasterizer_settings: Settings) -> Any:
@@ -222,21 +224,17 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
 
     if first == "depths":
         # It is known from the probe of signed colour on, in every later stage, that this renderer passes on SH.
-        stage, wrapper.rendering = wrapper.rendering, StageRendering(True, ColorPath.NATIVE, {}, capture=True)
-        render(view)
-        wrapper.rendering = stage
+        with stages.rendering_as(StageRendering(True, ColorPath.NATIVE, {}, capture=True)):
+            render(view)
     found = render(view)
-    assert wrapper.rendering.captured is not None
-    assert found["image"].unique().tolist() == wrapper.rendering.captured.unique().tolist() == [0.375]
+    assert rendering.captured is not None
+    assert found["image"].unique().tolist() == rendering.captured.unique().tolist() == [0.375]
     assert found["depths"].unique().tolist() == [0.5]
     found["image"].sum().backward()
     with pytest.raises(UserInputError, match="other colours than the model's"):
         found["depths"].sum().backward()
     assert not caplog.records
-    wrapper.rendering.capture, wrapper.rendering.images = (
-        False,
-        SimpleNamespace(targets=None, weights=None, coarse=None),
-    )  # type: ignore[assignment]
+    rendering.capture, rendering.images = False, SimpleNamespace(targets=None, weights=None, coarse=None)
     render(view), render(view)
     (warning,) = (each.getMessage() for each in caplog.records)
     assert "in a residual they are those of its own Gaussians, not the scene's" in warning
@@ -245,7 +243,7 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
 @pytest.mark.parametrize("how", ["the camera", "a copy of its matrix", "a transposed matrix"])
 def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
     camera, images = made()
-    wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    _, wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
 
     def render(viewpoint: Any, matrix: Tensor) -> Tensor:
@@ -267,9 +265,10 @@ def test_a_view_is_composed_however_it_gets_to_the_rasterizer(how: str) -> None:
 def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo() -> None:
     """Joint training renders it at each reading."""
     camera, images = made()
-    wrapper, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
-    below, read = wrapper.rendering.accumulated, []  # type: ignore[union-attr]  # just set
-    wrapper.rendering.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))  # type: ignore[union-attr,assignment]
+    stages, _, settings, function = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    rendering: Any = stages.rendering
+    below, read = rendering.accumulated, []
+    rendering.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))
     place = camera.world_view_transform
     assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), place))[1].unique().tolist() == [0.75]
     assert read == [images.key(camera)]
@@ -312,7 +311,7 @@ def test_photos_of_one_camera_are_composed_alike_and_not_mistaken_for_each_other
 
 def test_training_on_a_view_that_is_not_recognised_stops() -> None:
     camera, images = made()
-    _, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    _, _, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
     means = torch.zeros(2, 3, requires_grad=True)
     image = function(means, settings(3, 4, torch.ones(3), torch.eye(4)))[1]
     assert image.unique().tolist() == [GREY], "a viewer may look"
@@ -324,7 +323,7 @@ def test_training_on_a_view_that_is_not_recognised_stops() -> None:
 def test_a_render_of_another_size_is_said() -> None:
     """DashGaussian's frequency schedule renders a view smaller than its level."""
     camera, images = made()
-    wrapper, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    _, wrapper, settings, function = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
     render = wrapper.renderer(lambda view: function(torch.zeros(2, 3), settings(2, 2, torch.ones(3), torch.eye(4))))
     with pytest.raises(UserInputError, match=r"renders view photo at 2x2, expected 4x3.*--hierarchy nested") as caught:
         render(camera)
@@ -333,7 +332,7 @@ def test_a_render_of_another_size_is_said() -> None:
 
 def test_outputs_without_an_image_are_named() -> None:
     camera, images = made()
-    wrapper, settings, _ = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
+    _, wrapper, settings, _ = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
     broken = wrapper._function(lambda rasterizer_settings: (torch.zeros(2, 3, 4), torch.zeros(2)))
     with pytest.raises(UserInputError, match=r"returns \(2, 3, 4\), \(2,\), expected an image \(3, h, w\) of 4x3"):
         broken(rasterizer_settings=settings(3, 4, torch.ones(3), torch.eye(4)))
@@ -343,7 +342,7 @@ def test_outputs_without_an_image_are_named() -> None:
 def test_an_image_is_the_first_three_of_more_channels(leading: tuple[int, ...]) -> None:
     """As of a rasterizer that returns normals, depth and opacity in one tensor with the colours."""
     camera, images = made()
-    wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
+    _, wrapper, settings, _ = residual(camera, images.key(camera), torch.full((3, 3, 4), 0.25))
 
     def forward(means: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
         rows = torch.arange(5.0).reshape(*leading, 5, 1, 1) + means.mean()
