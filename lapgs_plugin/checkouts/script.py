@@ -64,7 +64,8 @@ def require_script(path: Path) -> Path:
 def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
     """Execute the definitions of a script in a fresh `__main__`, with its arguments in `sys.argv`.
 
-    The script's folder takes the place of the launcher's in `sys.path`, so that both find the same modules. At the end `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are restored.
+    The script's folder takes the place of the launcher's in `sys.path`, as with `python`. At the end
+    `sys.argv`, `sys.path`, the standard streams (some checkouts replace them) and `__main__` are restored.
     The checkout's modules are removed from `sys.modules`: another checkout may have modules of the same names.
 
     Raises:

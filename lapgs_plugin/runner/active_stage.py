@@ -25,7 +25,7 @@ from lapgs_plugin.errors import (
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
-from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, StageResult, TrainingRun
+from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_model import StageModel
@@ -43,7 +43,7 @@ class ActiveStage(RunningStage):
     """Train a stage, or restore it from the archive, inside of `Stages.run`.
 
     Args:
-        context, run, window: the stage, its run, and its place there.
+        run, window: the stage, its run, and its place there.
         call: the script's call of `training` that trains the stage.
         finished: the stages before, coarsest first.
         before: result of the last of them; None for the base.
@@ -58,18 +58,17 @@ class ActiveStage(RunningStage):
 
     def __init__(
         self,
-        context: CheckoutRun,
         run: TrainingRun,
         window: StageWindow,
         call: TrainingCall,
         finished: Sequence[FinishedStage],
         before: StageResult | None,
     ) -> None:
-        self._views = StageViews(context, run, window.stage, call, None if before is None else before.predictions)
-        super().__init__(window.stage, self._views.rendering, StageRecord(context, run.archive, window))
-        self._context, self._run, self.window, self._finished, self._call = context, run, window, finished, call
-        self._options, self._adapter, self._archive = context.options, context.adapter, run.archive
-        self._model = StageModel(context, run.scene, self.stage, before)
+        self._views = StageViews(run, window.stage, call, None if before is None else before.predictions)
+        super().__init__(window.stage, self._views.rendering, StageRecord(run, window))
+        self._context, self._run, self.window, self._finished, self._call = run.context, run, window, finished, call
+        self._options, self._adapter, self._archive = run.context.options, run.context.adapter, run.archive
+        self._model = StageModel(run, self.stage, before)
         self._joint: JointLevels | None = None
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
@@ -316,7 +315,7 @@ class ActiveStage(RunningStage):
         """Optimize the finished fields, too, and render them instead of reading their predictions."""
         self.record.note_memory(self._views.bytes_on_device)
         self._views.drop_predictions()
-        self._joint = JointLevels(self._context, self._run, self._finished, self._views)
+        self._joint = JointLevels(self._run, self._finished, self._views)
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
         self.rendering.accumulated = self._joint

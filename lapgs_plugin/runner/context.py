@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass
-class CheckoutRun:
+class CheckoutContext:
     """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
 
     Attributes:
@@ -96,6 +96,7 @@ class CheckoutRun:
 class TrainingRun:
     """Hold the objects of a run that exist once the script has called `training`."""
 
+    context: CheckoutContext
     call: TrainingCall  # for the whole run
     scene: CheckoutScene
     archive: RunArchive  # open for writing

@@ -38,7 +38,7 @@ from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, StageResult, TrainingRun
+from lapgs_plugin.runner.context import CheckoutContext, FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.dry_run import DryRun, undisturbed
 from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
@@ -93,7 +93,7 @@ class HierarchyDriver:
         self._resume, self._overwrite = resume, overwrite
         place, measuring = torch.device(device), measuring or MeasuringOptions()
         stages, parts = Stages(), IterationParts(place, measuring.breakdown)
-        self._context = CheckoutRun(
+        self._context = CheckoutContext(
             adapter=adapter,
             options=options,
             device=place,
@@ -180,12 +180,12 @@ class HierarchyDriver:
             with self._open_archive(folder, manifest) as archive:
                 self._context.watcher.run_started(archive)
                 try:
-                    run = TrainingRun(call, scene, archive, path)
+                    run = TrainingRun(self._context, call, scene, archive, path)
                     self._log_schedule(call)
                     if self._has_residuals:
                         returned = self._run_stages(run, plan, Path(scratch))
                     else:
-                        returned = SingleCall(self._context, run, plan).train(Path(scratch))
+                        returned = SingleCall(run, plan).train(Path(scratch))
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", given, kept)
@@ -209,7 +209,7 @@ class HierarchyDriver:
         for stage in plan:
             window = self._context.window(plan, stage)
             call = self._stage_call(run, window)
-            active = ActiveStage(self._context, run, window, call, tuple(finished), before)
+            active = ActiveStage(run, window, call, tuple(finished), before)
             with self._context.stages.run(active):
                 if stage.level in run.archive.available_levels:
                     before = active.restore()

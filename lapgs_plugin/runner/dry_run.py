@@ -35,7 +35,7 @@ from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.archived_values import NESTED_WORKS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.context import CheckoutRun
+from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.running_stage import RunningStage
@@ -67,7 +67,7 @@ class DryRun:
     """
 
     def __init__(
-        self, context: CheckoutRun, call: TrainingCall, scene: CheckoutScene, plan: StagePlan, schedule: Schedule
+        self, context: CheckoutContext, call: TrainingCall, scene: CheckoutScene, plan: StagePlan, schedule: Schedule
     ) -> None:
         self._context, self._scene, self._plan, self._schedule = context, scene, plan, schedule
         self._adapter = context.adapter
@@ -95,14 +95,10 @@ class DryRun:
                 rendering.accumulated = _Nothing(sizes, self._context.device)
                 rendering.composed = frozenset(self._cameras)
             call = self._scratch_call(folder)
-
-            def stage_of(call: TrainingCall) -> _DryStage:
-                return _DryStage(call, rendering, self._stage, lambda gaussians: self._scene_for(call, gaussians))
-
-            stage = stage_of(call)
+            stage = _DryStage(self._stage, rendering, call, self._scene_for)
             self._iterate(stage, works)
             if self._stage.signed:
-                self._iterate_later(stage_of, call)
+                self._iterate_later(rendering, call)
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
             with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
@@ -166,7 +162,7 @@ class DryRun:
                 f"{CLOCK}, or one step of the positions, an iteration; {OFF}"
             )
 
-    def _iterate_later(self, stage_of: Callable[[TrainingCall], _DryStage], call: TrainingCall) -> None:
+    def _iterate_later(self, rendering: StageRendering, call: TrainingCall) -> None:
         """Run an iteration with all losses that begin later in a run, of which some cannot be a residual's.
 
         The base would be trained before that is found out. What else fails does so because nothing led up to it.
@@ -174,10 +170,10 @@ class DryRun:
         later = self._schedule.begun(self._call.variables, self._plan.iterations)
         if not later.notes:
             return
-        call = later.applied_to(call)
+        stage = _DryStage(self._stage, rendering, later.applied_to(call), self._scene_for)
         try:
-            with self._context.stages.run(stage_of(call)):
-                call.run()
+            with self._context.stages.run(stage):
+                stage.call.run()
         except LapgsError:
             raise
         except Exception as error:
@@ -365,10 +361,10 @@ class _DryStage(RunningStage):
 
     def __init__(
         self,
-        call: TrainingCall,
-        rendering: StageRendering,
         stage: Stage,
-        make_scene: Callable[[Any], Any],
+        rendering: StageRendering,
+        call: TrainingCall,
+        make_scene: Callable[[TrainingCall, Any], Any],
     ) -> None:
         super().__init__(stage, rendering, LoopRecord(torch.device("cpu")))  # what it measures is dropped
         self.call, self._make_scene = call, make_scene
@@ -391,7 +387,7 @@ class _DryStage(RunningStage):
 
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
-        return self._make_scene(gaussians)
+        return self._make_scene(self.call, gaussians)
 
     def iteration_begins(self, gaussians: Any) -> None:
         if self.iteration:

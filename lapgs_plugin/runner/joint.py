@@ -21,7 +21,7 @@ from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.ops.composition import compose
 from lapgs_plugin.ops.upsample import upsample
-from lapgs_plugin.runner.context import CheckoutRun, FinishedStage, TrainingRun
+from lapgs_plugin.runner.context import FinishedStage, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 
@@ -49,18 +49,16 @@ class JointLevels:
     """Render the predictions of coarser levels in place of cached ones, and optimize the fields behind them.
 
     Args:
-        context, run: the run, whose archive has the coarser fields.
+        run: the run, whose archive has the coarser fields.
         finished: the coarser stages, coarsest first.
         views: of the running stage.
     """
 
     where = "gpu"  # nothing has to be copied
 
-    def __init__(
-        self, context: CheckoutRun, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews
-    ) -> None:
-        self._context, self._run, self._views = context, run, views
-        self._pyramid = Pyramid(context.options.grid)
+    def __init__(self, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews) -> None:
+        self._context, self._run, self._views = run.context, run, views
+        self._pyramid = Pyramid(run.context.options.grid)
         self._fields = [self._load(one) for one in finished]
 
     def _load(self, finished: FinishedStage) -> _JointField:

@@ -14,7 +14,7 @@ from lapgs_plugin.checkouts.viewer_port import sharing_ports
 from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_ssim
-from lapgs_plugin.runner.context import CheckoutRun
+from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.running_stage import RunningStage
@@ -37,7 +37,7 @@ class StageReplacements:
 
     def __init__(
         self,
-        context: CheckoutRun,
+        context: CheckoutContext,
         train: Callable[[TrainingCall], Any],
     ) -> None:
         self._context, self._train = context, train

@@ -21,7 +21,7 @@ from lapgs_plugin.checkouts.training_call import CHECKPOINTS
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
-from lapgs_plugin.runner.context import CheckoutRun, StageResult, TrainingRun
+from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import pruning_iteration
 
@@ -78,11 +78,11 @@ class SingleCall:
     """Train all nested levels of a run that are not in its archive.
 
     Args:
-        context, run, plan: the run.
+        run, plan: the run.
     """
 
-    def __init__(self, context: CheckoutRun, run: TrainingRun, plan: StagePlan) -> None:
-        self._context, self._run, self._plan = context, run, plan
+    def __init__(self, run: TrainingRun, plan: StagePlan) -> None:
+        self._context, self._run, self._plan = run.context, run, plan
         finished = len(run.archive.available_levels)
         self._done, self._left = list(plan)[:finished], list(plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
@@ -115,7 +115,7 @@ class SingleCall:
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
         window = self._context.window(self._plan, self._left.pop(0))
-        return NestedStage(self._context, self._run, window, self._call, (), before, advance=self._advance)
+        return NestedStage(self._run, window, self._call, (), before, advance=self._advance)
 
     def _begin(self) -> None:
         own = self._run.call.opt
@@ -137,7 +137,7 @@ class SingleCall:
     def _restored(self, stage: Stage) -> StageResult:
         """Return the result of a stage that an earlier process archived."""
         archive = self._run.archive
-        carried, moments = StageModel(self._context, self._run.scene, stage, None).load_inherited(archive)
+        carried, moments = StageModel(self._run, stage, None).load_inherited(archive)
         return StageResult(archive.field(stage.level), None, carried, moments)
 
     def _run_from(self, iteration: int) -> Any:

@@ -14,8 +14,7 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
-from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.context import CheckoutRun, StageResult
+from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import OPTIMIZER
@@ -27,9 +26,9 @@ SH_REST = "f_rest"
 class StageModel:
     """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
 
-    def __init__(self, context: CheckoutRun, scene: CheckoutScene, stage: Stage, before: StageResult | None) -> None:
-        self._options, self._adapter, self._device = context.options, context.adapter, context.device
-        self._scene, self._stage, self._before = scene, stage, before
+    def __init__(self, run: TrainingRun, stage: Stage, before: StageResult | None) -> None:
+        self._options, self._adapter, self._device = run.context.options, run.context.adapter, run.context.device
+        self._scene, self._stage, self._before = run.scene, stage, before
         self._kept: Tensor  # (n,) Gaussians of the level before that are inherited
 
     def initialise(self, gaussians: Any) -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 from lapgs_plugin.checkouts.training_call import StageWindow
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.runner.context import CheckoutRun, StageResult
+from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.loop_record import LoopRecord
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Overhead
 
@@ -21,9 +20,9 @@ HISTORY_ENTRIES = 200
 class StageRecord(LoopRecord):
     """Measure one stage and write the measurements into the run folder."""
 
-    def __init__(self, context: CheckoutRun, archive: RunArchive, window: StageWindow) -> None:
-        super().__init__(context.device, window.stage.iterations if context.measuring.gpu_busy else 0)
-        self._parts, self._archive, self._window = context.parts, archive, window
+    def __init__(self, run: TrainingRun, window: StageWindow) -> None:
+        super().__init__(run.context.device, window.stage.iterations if run.context.measuring.gpu_busy else 0)
+        self._parts, self._archive, self._window = run.context.parts, run.archive, window
 
     def start(self) -> None:
         """Start measuring GPU memory, and drop history entries of an interrupted run of this stage."""

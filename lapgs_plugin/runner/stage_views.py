@@ -16,7 +16,7 @@ from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.ops.composition import to_full_size
-from lapgs_plugin.runner.context import CheckoutRun, TrainingRun
+from lapgs_plugin.runner.context import TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
@@ -30,7 +30,7 @@ class StageViews:
     Views are named by the keys of `SceneImages`.
 
     Args:
-        context, run, stage: the stage and its run.
+        run, stage: the stage and its run.
         call: the script's call of `training` for this stage.
         predictions: Up(I_hat^(l+1)) of every view, closed with the other images; None for the base and nested levels.
 
@@ -43,13 +43,13 @@ class StageViews:
 
     def __init__(
         self,
-        context: CheckoutRun,
         run: TrainingRun,
         stage: Stage,
         call: TrainingCall,
         predictions: UpsampledImages | None,
     ) -> None:
-        self._context, self._call, self._stage, self._predictions = context, call, stage, predictions
+        self._context, self._call, self._stage, self._predictions = run.context, call, stage, predictions
+        context = run.context
         full, options, supervision = context.images, context.options, SUPERVISIONS[context.options.supervision]
         train, test = ({full.key(each): each for each in cameras} for cameras in (run.scene.train, run.scene.test))
         self.cameras, self.train, self.test = {**train, **test}, list(train), list(test)

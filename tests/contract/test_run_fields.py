@@ -167,7 +167,8 @@ def test_points_of_a_residual_have_what_a_fork_has_of_points() -> None:
     model = SimpleNamespace(create_from_pcd=lambda cloud, *others: given.append(cloud))
     field = some_field(5)
     stage, before = Stage(0, (8, 6), 20, signed=True), StageResult(field, None, {}, {})
-    StageModel(context, SimpleNamespace(points=points, others=(1.0,)), stage, before).initialise(model)  # type: ignore[arg-type]
+    run: Any = SimpleNamespace(context=context, scene=SimpleNamespace(points=points, others=(1.0,)))
+    StageModel(run, stage, before).initialise(model)
     (cloud,) = given
     np.testing.assert_array_equal(cloud.points, field.means.double().numpy())
     assert (cloud.colors == 0.5).all()

@@ -20,7 +20,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runner import joint
-from lapgs_plugin.runner.context import CheckoutRun
+from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runs.archive import RunArchive
@@ -65,7 +65,7 @@ def test_renders_of_one_colour_share_their_background() -> None:
 
     others: dict[str, Any] = dict.fromkeys(("options", "images", "wrapper", "hooks", "parts", "watcher", "measuring"))
     adapter: Any = SimpleNamespace(render=render)
-    context: Any = CheckoutRun(adapter=adapter, device=torch.device("cpu"), stages=Stages(), **others)
+    context: Any = CheckoutContext(adapter=adapter, device=torch.device("cpu"), stages=Stages(), **others)
     for white, black in ((True, False), (False, False), (True, True), (True, False)):
         with torch.inference_mode(not given):
             context.render(rendering, SimpleNamespace(white_background=white), None, None, black=black)

@@ -109,7 +109,8 @@ def test_a_profile_that_ends_with_the_stage_leaves_no_part_running(monkeypatch: 
     context: Any = SimpleNamespace(device=torch.device("cpu"), parts=parts, measuring=SimpleNamespace(gpu_busy=True))
     window: Any = SimpleNamespace(stage=SimpleNamespace(iterations=5, level=0))
     archive: Any = SimpleNamespace(rewind_history=lambda level, iteration: None)
-    record = StageRecord(context, archive, window)
+    run: Any = SimpleNamespace(context=context, archive=archive)
+    record = StageRecord(run, window)
     record.start()
     record.start_clock()
     for iteration in range(1, 6):
