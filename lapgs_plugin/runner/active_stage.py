@@ -27,10 +27,10 @@ from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
+from lapgs_plugin.runner.loop_record import StageRecord
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
-from lapgs_plugin.runner.stage_record import StageRecord
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
@@ -65,7 +65,8 @@ class ActiveStage(RunningStage):
         before: StageResult | None,
     ) -> None:
         self._views = StageViews(run, window.stage, call, None if before is None else before.predictions)
-        super().__init__(window.stage, self._views.rendering, StageRecord(run, window))
+        record = StageRecord(run.archive, window, run.context.parts, run.context.measuring.gpu_busy)
+        super().__init__(window.stage, self._views.rendering, record)
         self._context, self._run, self.window, self._finished, self._call = run.context, run, window, finished, call
         self._options, self._adapter, self._archive = run.context.options, run.context.adapter, run.archive
         self._model = StageModel(run, self.stage, before)
@@ -178,7 +179,7 @@ class ActiveStage(RunningStage):
         """Announce the stage and start its measurements."""
         self._log_start()
         self.record.start()
-        self._context.hooks.stage_begins(self.stage)
+        self._context.hooks.on_stage_start(self.stage)
         self._context.watcher.stage_started(self.stage)
 
     def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
@@ -212,12 +213,13 @@ class ActiveStage(RunningStage):
             None,
         )  # an error from here on is not one despite which it is archived
         self.record.stop(self._views.bytes_on_device)
-        self._context.hooks.stage_ends(self.stage)
+        self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)
         joint = None if self._joint is None else self._joint.fields(self._exported)
         self._require_finite({self.stage.level: field, **(joint or {})})
-        result = self._result(gaussians, field, self._model.carried(gaussians), self._model.moments(gaussians))
-        self.record.archive(result, joint)
+        inherited = {"carried": self._model.carried(gaussians), "moments": self._model.moments(gaussians)}
+        result = self._result(gaussians, field, **inherited)
+        self.record.archive(field, inherited, joint)
         if self._views.test and (self.stage.level <= 1 or self._context.measuring.test_every is not None):
             self._evaluate(gaussians)
         psnr = last_psnr(self._archive.history()) if self.stage.level == 0 else {}

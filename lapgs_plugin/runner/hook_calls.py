@@ -27,7 +27,7 @@ from lapgs_plugin.runner.running_stage import Stages
 logger = logging.getLogger(__name__)
 
 
-class HookCaller:
+class HookCaller(HookDispatcher):
     """Call users' hooks; false without hooks, so that a run without them has no overhead.
 
     Args:
@@ -40,24 +40,19 @@ class HookCaller:
     """
 
     def __init__(self, stages: Stages, hooks: Sequence[StageHook] = (), registered: str = ALL) -> None:
-        found = (*entry_point_hooks(registered), *hooks)
+        super().__init__((*entry_point_hooks(registered), *hooks))
         if (line := hooks_line(registered)) is not None:
             logger.info("%s", line)
-        self._stages, self._hooks, self._any = stages, HookDispatcher(found), bool(found)
+        self._stages = stages
         self._context: StageContext | None = None
         self._paused = False
 
     def __bool__(self) -> bool:
-        return self._any
+        return bool(self._hooks)
 
-    def stage_begins(self, stage: Stage) -> None:
-        """Call `on_stage_start`."""
+    def on_stage_start(self, stage: Stage) -> None:
         self._context = None
-        self._hooks.on_stage_start(stage)
-
-    def stage_ends(self, stage: Stage) -> None:
-        """Call `on_stage_end`."""
-        self._hooks.on_stage_end(stage)
+        super().on_stage_start(stage)
 
     def pausing(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function during which no hook is called for an image.
@@ -91,9 +86,9 @@ class HookCaller:
         added = context.accumulated if below is None else None
         if added is not None:
             image = image + added
-        self._hooks.before_render(context)
-        image = self._hooks.compose(context, image)
-        term = self._hooks.extra_loss(context, image)
+        self.before_render(context)
+        image = self.compose(context, image)
+        term = self.extra_loss(context, image)
         result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
         return result if added is None else result - added
 
@@ -112,11 +107,11 @@ class HookCaller:
     def densified(self) -> None:
         """Call `on_densify`."""
         if self._context is not None:
-            self._hooks.on_densify(self._context)
+            self.on_densify(self._context)
 
     def _after_backward(self) -> None:
         assert self._context is not None
-        self._hooks.after_backward(self._context)
+        self.after_backward(self._context)
 
 
 class _WithTerm(torch.autograd.Function):

@@ -35,16 +35,17 @@ class IterationParts:
         measures: whether to measure; without it no symbol is replaced.
 
     Attributes:
+        device: as given.
         breakdown: seconds of the running stage by part.
     """
 
     def __init__(self, device: torch.device, measures: bool) -> None:
-        self._device, self._measures = device, measures
+        self.device, self._measures = device, measures
         self.breakdown = Breakdown()
 
     def stage_begins(self) -> None:
         """Start the measurement of another stage."""
-        self.breakdown = breakdown_on(self._device) if self._measures else Breakdown()
+        self.breakdown = breakdown_on(self.device) if self._measures else Breakdown()
 
     def mark_render(self, part: str) -> None:
         """Mark the beginning of a part of a render with gradients: "forward", or "loss" when it has rasterized."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -92,7 +93,7 @@ class JointLevels:
                 following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS)
                 if self._context.device.type == "cuda":
                     fuse_steps(following)
-                leading.register_step_post_hook(_Follow(following))
+                leading.register_step_post_hook(partial(_follow, following))
 
     def prefetch(self, key: str) -> None:
         """Do nothing: predictions are rendered."""
@@ -116,17 +117,12 @@ class JointLevels:
         return {one.of.stage.level: read(one.gaussians, one.of.stage.signed) for one in self._fields}
 
 
-class _Follow:
-    """Step another optimizer after each step of the leading one, at its learning rates."""
-
-    def __init__(self, following: torch.optim.Optimizer) -> None:
-        self._following = following
-
-    def __call__(self, leading: torch.optim.Optimizer, *_: Any) -> None:
-        for group in self._following.param_groups:
-            group["lr"] = leading.param_groups[group["leader"]]["lr"] * group["factor"]
-        self._following.step()
-        self._following.zero_grad(set_to_none=True)
+def _follow(following: torch.optim.Optimizer, leading: torch.optim.Optimizer, *_: Any) -> None:
+    """Step an optimizer after a step of the leading one, at its learning rates."""
+    for group in following.param_groups:
+        group["lr"] = leading.param_groups[group["leader"]]["lr"] * group["factor"]
+    following.step()
+    following.zero_grad(set_to_none=True)
 
 
 def _no_image() -> Tensor:

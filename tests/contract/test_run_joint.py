@@ -112,8 +112,8 @@ def test_finished_fields_follow_optimizers_that_a_loop_makes_in_the_middle(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps: list[int] = []
-    step, folder = joint._Follow.__call__, tmp_path / "run"
-    monkeypatch.setattr(joint._Follow, "__call__", lambda *given: (step(*given), steps.append(1)))
+    step, folder = joint._follow, tmp_path / "run"
+    monkeypatch.setattr(joint, "_follow", lambda *given: (step(*given), steps.append(1)))
     with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, "--iterations", 30) as adapter:
         model = adapter.train.GaussianModel
         update, setup = model.update_learning_rate, model.training_setup
@@ -210,14 +210,14 @@ def test_gradients_reach_every_finished_field(
 def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The base's colours are not optimized at the higher rate of residuals."""
     rates: list[dict[str, float]] = []
-    original = joint._Follow.__call__
+    original = joint._follow
 
-    def follow(self: Any, *args: Any) -> None:
-        original(self, *args)
+    def follow(following: torch.optim.Optimizer, *args: Any) -> None:
+        original(following, *args)
         names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-        rates.append(dict(zip(names, (group["lr"] for group in self._following.param_groups), strict=True)))
+        rates.append(dict(zip(names, (group["lr"] for group in following.param_groups), strict=True)))
 
-    monkeypatch.setattr(joint._Follow, "__call__", follow)
+    monkeypatch.setattr(joint, "_follow", follow)
     run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", joint=0.25, residual_color_rate=4.0)
     assert len(rates) == 14, "a quarter of the stage's 60 iterations; after its last the checkout does not step"
     for found in rates:

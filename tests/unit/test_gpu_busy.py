@@ -13,7 +13,7 @@ from torch.autograd.profiler_util import Interval
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner.iteration_parts import IterationParts
-from lapgs_plugin.runner.stage_record import StageRecord
+from lapgs_plugin.runner.loop_record import StageRecord
 from lapgs_plugin.runs.gpu_busy import GpuBusy, kernel_seconds, profile_kernels, require_cuda
 
 
@@ -106,11 +106,9 @@ def test_on_a_gpu() -> None:
 def test_a_profile_that_ends_with_the_stage_leaves_no_part_running(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lapgs_plugin.runs.gpu_busy.profile_kernels", lambda: lambda: 0.5)
     parts = IterationParts(torch.device("cpu"), measures=True)
-    context: Any = SimpleNamespace(device=torch.device("cpu"), parts=parts, measuring=SimpleNamespace(gpu_busy=True))
     window: Any = SimpleNamespace(stage=SimpleNamespace(iterations=5, level=0))
     archive: Any = SimpleNamespace(rewind_history=lambda level, iteration: None)
-    run: Any = SimpleNamespace(context=context, archive=archive)
-    record = StageRecord(run, window)
+    record = StageRecord(archive, window, parts, gpu_busy=True)
     record.start()
     record.start_clock()
     for iteration in range(1, 6):
