@@ -160,7 +160,7 @@ class StageRecord(LoopRecord):
     def archive(
         self, field: GaussianField, inherited: dict[str, Any], joint_fields: Mapping[int, GaussianField] | None
     ) -> None:
-        """Write the stage's field and measurements, what the next stage inherits, and jointly trained coarser fields."""
+        """Write the stage's field, measurements, what the next stage inherits, and jointly trained coarser fields."""
         stage = self._window.stage
         self._archive.finish_level(
             LevelRecord(

@@ -17,7 +17,6 @@ from lapgs_plugin.runner import checkout_ssim
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
-from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.step_clock import timing_replacements
 
 STATISTICS = "add_densification_stats"
@@ -35,12 +34,8 @@ class StageReplacements:
         train: called in place of the script's `training`.
     """
 
-    def __init__(
-        self,
-        context: CheckoutContext,
-        train: Callable[[TrainingCall], Any],
-    ) -> None:
-        self._context, self._train = context, train
+    def __init__(self, context: CheckoutContext, train: Callable[[TrainingCall], Any]) -> None:
+        self._context, self._stages, self._train = context, context.stages, train
         self._controlling = False  # whether a method of density control is running
 
     def in_script(self) -> list[Replacement]:
@@ -72,7 +67,7 @@ class StageReplacements:
                 for camera in profile.cameras
             ),
             *self._context.wrapper.replacements(profile, "the training loop, score functions and reports"),
-            *timing_replacements(profile, self._running),
+            *timing_replacements(profile, lambda: self._stages.running),
             *self._in_model(profile),
             *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
@@ -80,11 +75,8 @@ class StageReplacements:
             *parts.replacements(profile, adapter.info),
         ]
 
-    def _running(self) -> RunningStage | None:
-        return self._context.stages.running
-
     def _in_residual(self) -> bool:
-        stage = self._running()
+        stage = self._stages.running
         return stage is not None and stage.stage.signed
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
@@ -131,7 +123,7 @@ class StageReplacements:
 
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def make_scene(*args: Any, **kwargs: Any) -> Any:
-            stage = self._running()
+            stage = self._stages.running
             assert stage is not None, "training() makes its scene inside a stage"
             model = self._context.adapter.profile.model
             gaussians = next((value for value in (*args, *kwargs.values()) if isinstance(value, model)), None)
@@ -144,7 +136,7 @@ class StageReplacements:
         @wraps(original)
         def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
-            if (stage := self._running()) is not None:
+            if (stage := self._stages.running) is not None:
                 if stage.trains(gaussians):
                     stage.optimizers_made(gaussians)
                 elif stage.stage.signed:
@@ -167,7 +159,7 @@ class StageReplacements:
                 result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
-            if outermost and (stage := self._running()) is not None and stage.trains(gaussians):
+            if outermost and (stage := self._stages.running) is not None and stage.trains(gaussians):
                 stage.densified(gaussians)
             return result
 
@@ -178,7 +170,7 @@ class StageReplacements:
 
         @wraps(original)
         def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            stage = self._running()
+            stage = self._stages.running
             if stage is None or stage.resets_opacities:
                 return control(gaussians, *args, **kwargs)
             return None

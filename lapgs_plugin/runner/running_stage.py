@@ -51,11 +51,12 @@ class Stages:
 
     Attributes:
         running: the stage that answers the replaced symbols; None between stages.
+        rendering: how the checkout's rasterizers render; None leaves their calls unchanged.
     """
 
     def __init__(self) -> None:
         self.running: RunningStage | None = None
-        self._instead: StageRendering | None = None
+        self.rendering: StageRendering | None = None
 
     @contextmanager
     def run(self, stage: RunningStage) -> Iterator[None]:
@@ -63,23 +64,16 @@ class Stages:
         assert self.running is None, "one stage runs at a time"
         self.running = stage
         try:
-            with stage.entered():
+            with self.rendering_as(stage.rendering), stage.entered():
                 yield
         finally:
             self.running = None
 
-    @property
-    def rendering(self) -> StageRendering | None:
-        """How the checkout's rasterizers render; None leaves their calls unchanged."""
-        if self._instead is not None or self.running is None:
-            return self._instead
-        return self.running.rendering
-
     @contextmanager
     def rendering_as(self, rendering: StageRendering) -> Iterator[None]:
-        """Render otherwise than the running stage inside."""
-        outer, self._instead = self._instead, rendering
+        """Render otherwise inside, with or without a running stage."""
+        outer, self.rendering = self.rendering, rendering
         try:
             yield
         finally:
-            self._instead = outer
+            self.rendering = outer

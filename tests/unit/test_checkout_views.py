@@ -119,8 +119,8 @@ def residual(camera: Camera, key: str, below: Tensor) -> tuple[Stages, Rasterize
     store = SimpleNamespace(get=lambda _: below, prefetch=lambda _: None)
     views = {key: camera}
     rendering = StageRendering(True, ColorPath.NATIVE, views, accumulated=store, composed=frozenset(views))
-    stages: Any = Stages()
-    stages.running = SimpleNamespace(rendering=rendering)
+    stages = Stages()
+    stages.rendering = rendering
     wrapper = RasterizerWrapper(stages)
     return stages, wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
 
