@@ -18,13 +18,11 @@ from lapgs_plugin.errors import (
     LapgsError,
     MissingExtraError,
     TrainingDivergedError,
-    UserInputError,
     first_line,
     typed_line,
 )
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
-from lapgs_plugin.runner.archived_values import NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointLevels
 from lapgs_plugin.runner.loop_record import StageRecord
@@ -337,22 +335,14 @@ class ActiveStage(RunningStage):
             )
 
     def _compare(self, gaussians: Any, field: GaussianField) -> None:
-        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run.
-
-        Raises:
-            UserInputError: they differ, and a residual would be added to another image than the checkout's.
-        """
-        builds_on = self.stage.level > 0 and not self._options.nested
-        if self.stage.level > 0 and not builds_on:
+        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run."""
+        if self.stage.level > 0 and self._options.nested:
             return
         rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)
+        state = f"; level {self.stage.level} is in the run folder"
         with self.record.after_archive("evaluation"), torch.no_grad():
-            self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
-            assert rendering.call is not None, "as it captures"
-            problem = explain_other_values(self._adapter, rendering.call, field)
-        if problem and builds_on:
-            raise UserInputError(f"{problem}; {NO_RESIDUALS}; level {self.stage.level} is in the run folder")
-        self._context.warn_of_other_images(problem)
+            captured = self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
+            self._context.compare(captured, field, residual_follows=self.stage.level > 0, state=state)
 
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""

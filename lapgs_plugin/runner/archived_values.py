@@ -93,6 +93,6 @@ def _values_beside(captured: Captured, field: GaussianField) -> Iterator[str]:
         if not (isinstance(value, Tensor) and value.is_floating_point() and value.shape[:1] == (len(field),)):
             continue
         if value.numel() == len(field) and not any(part in name for part in OF_FIELDS):
-            image, plain = (captured.image(**{name: each}) for each in (value, torch.ones_like(value)))
+            image, plain = (captured.repeated(**{name: each}) for each in (value, torch.ones_like(value)))
             if not torch.allclose(image, plain, rtol=SAME_VALUE, atol=SAME_VALUE):
                 yield name

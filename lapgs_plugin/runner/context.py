@@ -14,17 +14,18 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.archived_values import ADAPTER_MENDS
+from lapgs_plugin.runner.archived_values import ADAPTER_MENDS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
-from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
@@ -54,8 +55,15 @@ class CheckoutContext:
     measuring: MeasuringOptions
     _told: set[str] = field(default_factory=set)
 
-    def warn_of_other_images(self, problem: str) -> None:
-        """Warn once, if there is a problem, that archived fields show other images than the checkout."""
+    def compare(self, captured: Captured, field: GaussianField, *, residual_follows: bool, state: str = "") -> None:
+        """Compare what the checkout renders of a model with its archived field, and warn once if they differ.
+
+        Raises:
+            UserInputError: they differ, and a residual would be added to another image; `state` ends the line.
+        """
+        problem = explain_other_values(self.adapter, captured, field)
+        if problem and residual_follows:
+            raise UserInputError(f"{problem}; {NO_RESIDUALS}{state}")
         if problem and problem not in self._told:
             self._told.add(problem)
             line = f"{problem}: lapgs eval, render and view show other images than the checkout's own render"
@@ -69,8 +77,8 @@ class CheckoutContext:
 
     def render(
         self, rendering: StageRendering, call: TrainingCall, view: Any, gaussians: Any, *, black: bool = False
-    ) -> Tensor:
-        """Return the image (3, h, w) that the checkout's render makes of a view, before exposure or clamping.
+    ) -> Captured:
+        """Render a view as the checkout does.
 
         Args:
             rendering: replaces the running stage's meanwhile; it captures.
@@ -81,9 +89,9 @@ class CheckoutContext:
         """
         with self.stages.rendering_as(rendering):
             self.adapter.render(call, view, gaussians, self._backgrounds[call.white_background and not black])
-        image, rendering.captured = rendering.captured, None
-        assert image is not None, "a rendering that captures"
-        return image
+        captured, rendering.captured = rendering.captured, None
+        assert captured is not None, "a rendering that captures"
+        return captured
 
     @cached_property
     @torch.inference_mode(False)  # kept for later calls, which may need gradients

@@ -30,10 +30,9 @@ from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
-from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
-from lapgs_plugin.runner.archived_values import NESTED_WORKS, NO_RESIDUALS, explain_other_values
+from lapgs_plugin.runner.archived_values import NESTED_WORKS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.loop_record import LoopRecord
@@ -72,7 +71,6 @@ class DryRun:
         self._context, self._scene, self._plan, self._schedule = context, scene, plan, schedule
         self._adapter = context.adapter
         self._call = call
-        self._captured: Captured | None = None  # the last render
         self._cameras = {context.images.key(camera): camera for camera in (*scene.train, *scene.test)}
         # Residuals ask for more than other stages do.
         self._stage = next((stage for stage in plan if stage.signed), next(iter(plan)))
@@ -102,14 +100,15 @@ class DryRun:
             self._require_parameters(stage.gaussians)
             view = self._view(self._scene.train[0])
             with self._step("a view rendered as the loop does", "an image (3, h, w)", OFF):
-                image = self._render(view, stage.gaussians)
+                captured = self._render(view, stage.gaussians)
             with self._step("the model as a field for the archive", "the parameters of 3DGS", OFF):
                 field = self._adapter.export_field(stage.gaussians, signed=False)
-            self._compare(field)
+            with self._step("the last render repeated", "an image (3, h, w)", OFF):
+                self._context.compare(captured, field, residual_follows=self._stage.signed)
             if self._stage.signed:
                 with self._step("a model made from a finished field", "one that renders", NESTED_MAY_WORK):
                     self._render(view, self._adapter.model_of(stage.call, field))
-            self._evaluate(view, image)
+            self._evaluate(view, captured.image)
 
     def color_path(self) -> ColorPath:
         """Return how the checkout's rasterizer evaluates signed colour, which is found out by rendering.
@@ -201,26 +200,11 @@ class DryRun:
         size = level_size(image.size, self._stage.level)
         return self._adapter.view_at(camera, size, self._stage.signed, lambda: shrunk(image.load(device), size))
 
-    def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Tensor:
-        """Return the image (3, h, w) of a view over black, of a residual if `path` is given."""
+    def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Captured:
+        """Render a view over black, of a residual if `path` is given."""
         rendering = StageRendering(path is not None, path or ColorPath.NATIVE, self._cameras, capture=True)
         call = self._call if path is None else self._adapter.call_of_residuals(self._call)
-        image = self._context.render(rendering, call, view, gaussians, black=True)
-        self._captured = rendering.call
-        return image
-
-    def _compare(self, field: GaussianField) -> None:
-        """Compare a field with what the checkout's rasterizer got for its model.
-
-        Raises:
-            UserInputError: they differ, and a residual would be added to another image than the checkout's.
-        """
-        assert self._captured is not None, "a view was rendered"
-        with self._step("the last render repeated", "an image (3, h, w)", OFF):
-            problem = explain_other_values(self._adapter, self._captured, field)
-        if problem and self._stage.signed:
-            raise UserInputError(f"{problem}; {NO_RESIDUALS}")
-        self._context.warn_of_other_images(problem)
+        return self._context.render(rendering, call, view, gaussians, black=True)
 
     def _require_parameters(self, gaussians: Any) -> None:
         """Refuse a model that lacks what a field has, unless its adapter makes fields otherwise."""
@@ -316,7 +300,7 @@ class DryRun:
     def _colored(self, view: Any, gaussians: Any, path: ColorPath) -> tuple[Tensor, Tensor]:
         """Return the image of a residual and the gradient of its sum by the first SH coefficients."""
         with torch.enable_grad():
-            image = self._render(view, gaussians, path)
+            image = self._render(view, gaussians, path).image
             (gradient,) = torch.autograd.grad(image.sum(), gaussians._features_dc, allow_unused=True)
         return image.detach(), torch.zeros_like(gaussians._features_dc) if gradient is None else gradient
 

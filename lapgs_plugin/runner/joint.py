@@ -110,7 +110,7 @@ class JointLevels:
             stage, camera = one.of.stage, self._views.cameras[key]
             size = self._views.size(key, stage.level)
             one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
-        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians)
+        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians).image
 
     def fields(self, read: Callable[[Any, bool], GaussianField]) -> dict[int, GaussianField]:
         """Return the fields by level; `read` makes one from the checkout's model and whether it is a residual."""

@@ -155,7 +155,8 @@ class BareRunRecorder(TimedLoop):
             """Return a view's image, captured at the checkout's rasterizer, and its photo; (3, h, w) each."""
             self._adapter.render(call, camera, self.gaussians, background)
             assert rendering.captured is not None, "render() rasterizes"
-            return rendering.captured, camera.original_image.to(rendering.captured.device)
+            image = rendering.captured.image
+            return image, camera.original_image.to(image.device)
 
         wrapped = RasterizerWrapper(stages).replacements(self._adapter.profile, "render()")
         with stages.rendering_as(rendering), Attachment(wrapped):

@@ -62,7 +62,7 @@ def _visibility(views: StageViews, gaussians: Any, path: ColorPath) -> Tensor:
     alone = StageRendering(signed=False, path=path, views={}, capture=True)
     colors, degree = gaussians._features_dc, gaussians.active_sh_degree
     grey = torch.nn.Parameter(torch.zeros_like(colors))
-    images = (views.render_alone(alone, gaussians, key) for key in views.train)
+    images = (views.render_alone(alone, gaussians, key).image for key in views.train)
     try:
         gaussians._features_dc, gaussians.active_sh_degree = grey, 0
         return blended_pixels(images, grey)

@@ -46,16 +46,18 @@ class Captured:
     """Hold the last call of a checkout's rasterizer for a model's colours.
 
     Attributes:
+        image: (3, h, w) composed image, before exposure or clamping.
         rasterizer: with its settings.
         inputs: by name.
         settings: of the rasterizer.
     """
 
+    image: Tensor
     rasterizer: Callable[..., Any]
     inputs: Mapping[str, Any]
     settings: Any
 
-    def image(self, **others: Any) -> Tensor:
+    def repeated(self, **others: Any) -> Tensor:
         """Return the image (3, h, w) with other values of some inputs, not composed."""
         return RasterOutputs.of(self.rasterizer(**{**self.inputs, **others}), size_of(self.settings)).image
 
@@ -74,7 +76,7 @@ class StageRendering:
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
-        capture: keep the last composed image, before exposure or clamping, in `captured`, and its call in `call`.
+        capture: keep the last call in `captured`.
     """
 
     signed: bool
@@ -86,8 +88,7 @@ class StageRendering:
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     capture: bool = False
-    captured: Tensor | None = field(default=None, repr=False)
-    call: Captured | None = field(default=None, repr=False)
+    captured: Captured | None = field(default=None, repr=False)
     _told: bool = field(default=False, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 
@@ -211,7 +212,7 @@ class StageRendering:
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
         image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
         if self.capture:
-            self.captured, self.call = image, Captured(rasterizer, inputs, settings)
+            self.captured = Captured(image, rasterizer, inputs, settings)
         for each in outputs.maps_beside if self.signed else ():
             each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)

@@ -17,7 +17,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.context import TrainingRun
-from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
@@ -125,8 +125,8 @@ class StageViews:
             for key in self.test
         )
 
-    def render_alone(self, rendering: StageRendering, gaussians: Any, key: str, *, black: bool = True) -> Tensor:
-        """Return the image (3, h, w) of a view; `rendering` replaces the stage's, `black` the call's background."""
+    def render_alone(self, rendering: StageRendering, gaussians: Any, key: str, *, black: bool = True) -> Captured:
+        """Render a view; `rendering` replaces the stage's, `black` the call's background."""
         return self._context.render(rendering, self._call, self._view(key), gaussians, black=black)
 
     def take_over(self, before: StageViews) -> None:
@@ -176,7 +176,7 @@ class StageViews:
     def _composed(self, gaussians: Any, key: str) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
         rendering = replace(self.rendering, composed=frozenset(self.cameras), capture=True)
-        return self._context.render(rendering, self._call, self._view(key), gaussians)
+        return self._context.render(rendering, self._call, self._view(key), gaussians).image
 
     def _full_size(self, gaussians: Any, key: str) -> Tensor:
         """Return a view (3, h, w) at full resolution, with finer residuals of zero."""

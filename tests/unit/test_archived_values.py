@@ -39,7 +39,7 @@ def captured(**others: Any) -> Captured:
         "opacities": FIELD.opacity_logits.sigmoid()[:, None],
         "shs": FIELD.sh,
     }
-    return Captured(rasterizer, {**inputs, **others}, SETTINGS)
+    return Captured(torch.zeros(3, 2, 2), rasterizer, {**inputs, **others}, SETTINGS)
 
 
 @pytest.mark.parametrize(

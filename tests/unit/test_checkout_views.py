@@ -228,7 +228,7 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
             render(view)
     found = render(view)
     assert rendering.captured is not None
-    assert found["image"].unique().tolist() == rendering.captured.unique().tolist() == [0.375]
+    assert found["image"].unique().tolist() == rendering.captured.image.unique().tolist() == [0.375]
     assert found["depths"].unique().tolist() == [0.5]
     found["image"].sum().backward()
     with pytest.raises(UserInputError, match="other colours than the model's"):
