@@ -181,7 +181,8 @@ class HierarchyDriver:
                 self._context.watcher.run_started(archive)
                 try:
                     run = TrainingRun(self._context, call, scene, archive, path)
-                    self._log_schedule(call)
+                    acts = "; ".join(self._schedule.describe(call.variables)) or "nowhere"
+                    logger.info("%s acts by iteration: %s", self._adapter.script.path.name, acts)
                     if self._has_residuals:
                         returned = self._run_stages(run, plan, Path(scratch))
                     else:
@@ -227,10 +228,6 @@ class HierarchyDriver:
         if changed.notes:
             logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
         return changed.applied_to(call)
-
-    def _log_schedule(self, call: TrainingCall) -> None:
-        lines = self._schedule.describe(call.variables)
-        logger.info("%s acts by iteration: %s", self._adapter.script.path.name, "; ".join(lines) or "nowhere")
 
     @cached_property
     def _schedule(self) -> Schedule:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import torch
@@ -89,7 +89,8 @@ class HookCaller(HookDispatcher):
         self.before_render(context)
         image = self.compose(context, image)
         term = self.extra_loss(context, image)
-        result: Tensor = _WithTerm.apply(image, term, self._after_backward)  # type: ignore[no-untyped-call]  # torch's
+        done = partial(self.after_backward, context)
+        result: Tensor = _WithTerm.apply(image, term, done)  # type: ignore[no-untyped-call]  # torch's
         return result if added is None else result - added
 
     def _make_context(self, key: str, below: Tensor | None) -> StageContext:
@@ -108,10 +109,6 @@ class HookCaller(HookDispatcher):
         """Call `on_densify`."""
         if self._context is not None:
             self.on_densify(self._context)
-
-    def _after_backward(self) -> None:
-        assert self._context is not None
-        self.after_backward(self._context)
 
 
 class _WithTerm(torch.autograd.Function):

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
+from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.checkouts.viewer_port import sharing_ports
-from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, MANIFEST, write_text
@@ -80,8 +79,7 @@ class BareRunRecorder(TimedLoop):
                 "would be counted; leave it out"
             )
         return [
-            writing_whole_files(),
-            *sharing_ports(profile),
+            *beside_other_runs(profile),
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
             *(Replacement(profile.script.module, name, self._make_scene, "training()") for name in scenes),
         ]

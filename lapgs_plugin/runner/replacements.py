@@ -8,10 +8,9 @@ from functools import wraps
 from typing import Any
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
+from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.checkouts.viewer_port import sharing_ports
-from lapgs_plugin.checkouts.whole_ply import writing_whole_files
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_ssim
 from lapgs_plugin.runner.context import CheckoutContext
@@ -47,8 +46,7 @@ class StageReplacements:
         profile = self._context.adapter.profile
         require_matching_rasterizer(profile, self._context.adapter.info.title)
         return [
-            writing_whole_files(),
-            *sharing_ports(profile),
+            *beside_other_runs(profile),
             Replacement(profile.script.module, profile.training.__name__, self._make_training, "the main block"),
         ]
 

@@ -54,10 +54,8 @@ class TimedLoop(ABC):
 
     def is_stepped_by(self, optimizer: Optimizer) -> bool:
         """Return whether an optimizer steps the positions of the model."""
-        if self.gaussians is None:
-            return False
-        positions = self.gaussians._xyz
-        return any(parameter is positions for group in optimizer.param_groups for parameter in group["params"])
+        stepped = (parameter for group in optimizer.param_groups for parameter in group["params"])
+        return self.gaussians is not None and any(parameter is self.gaussians._xyz for parameter in stepped)
 
 
 def has_clock(profile: Profile) -> bool:
