@@ -206,10 +206,7 @@ class ActiveStage(RunningStage):
         Raises:
             LapgsError: training left nothing to archive, or NaN or inf.
         """
-        gaussians, self.gaussians = (
-            self.gaussians,
-            None,
-        )  # an error from here on is not one despite which it is archived
+        gaussians, self.gaussians = self.gaussians, None  # what fails from here on is not archived again
         self.record.stop(self._views.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)

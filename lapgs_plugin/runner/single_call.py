@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
-from lapgs_plugin.checkouts.training_call import CHECKPOINTS
+from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.runner.active_stage import ActiveStage
@@ -35,12 +35,19 @@ class NestedStage(ActiveStage):
     """Run one level of a call that trains all of them.
 
     Args:
+        run, window, call, before: as of `ActiveStage`.
         advance: called with the model before the first iteration of the next level; returns its stage.
-        others: as of `ActiveStage`.
     """
 
-    def __init__(self, *others: Any, advance: Callable[[Any], ActiveStage]) -> None:
-        super().__init__(*others)
+    def __init__(
+        self,
+        run: TrainingRun,
+        window: StageWindow,
+        call: TrainingCall,
+        before: StageResult | None,
+        advance: Callable[[Any], ActiveStage],
+    ) -> None:
+        super().__init__(run, window, call, (), before)
         self._advance = advance
         self._took_over = False
         if self._options.prune and (until := pruning_iteration(self._call)) is not None:
@@ -115,7 +122,7 @@ class SingleCall:
     def _next(self, before: StageResult | None = None) -> NestedStage:
         """Return the next stage; `before` is given if the stage before it was not trained by this call."""
         window = self._context.window(self._plan, self._left.pop(0))
-        return NestedStage(self._run, window, self._call, (), before, advance=self._advance)
+        return NestedStage(self._run, window, self._call, before, self._advance)
 
     def _begin(self) -> None:
         own = self._run.call.opt

@@ -16,8 +16,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.masks import fill_outside
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.object_values import fields_of, matrix_keys, size_of
-from lapgs_plugin.runner.raster_outputs import RasterOutputs
+from lapgs_plugin.runner.object_values import RasterOutputs, fields_of, matrix_keys, size_of
 from lapgs_plugin.runner.signed_calls import with_signed_colors
 from lapgs_plugin.runs.level_images import LevelImages
 
