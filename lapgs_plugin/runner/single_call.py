@@ -70,7 +70,8 @@ class NestedStage(ActiveStage):
 
     def _finish_despite(self, error: Exception) -> None:
         """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
-        if isinstance(error, RuntimeError) and self._took_over and self.iteration <= SOON:
+        by_size = isinstance(error, RuntimeError) and not isinstance(error, torch.cuda.OutOfMemoryError)
+        if by_size and self._took_over and self.iteration <= SOON:
             logger.warning(
                 "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
                 "views, or what it made of them, from before its loop cannot train nested levels in one call: "
