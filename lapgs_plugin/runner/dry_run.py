@@ -376,7 +376,7 @@ class _DryStage(RunningStage):
     def iteration_begins(self, gaussians: Any) -> None:
         if self.iteration:
             raise _Enough
-        self.record.count(1, len(gaussians._xyz))
+        self.record.count(1, gaussians=0)
 
 
 class _Nothing:
