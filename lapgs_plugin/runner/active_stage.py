@@ -47,8 +47,6 @@ class ActiveStage(RunningStage):
         before: result of the last of them; None for the base.
 
     Attributes:
-        scene_files: folder of the files that the checkout's Scene writes beside a model, for its viewers. They are
-            copied once the loop has a scene: some checkouts refuse an output folder that is there before they make it.
         returned: what the script's call returned, for its main block.
     """
 
@@ -72,7 +70,6 @@ class ActiveStage(RunningStage):
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
-        self.scene_files: Path | None = None
         self.returned: Any = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
 
@@ -103,19 +100,12 @@ class ActiveStage(RunningStage):
     def has_more(self) -> bool:
         return self.iteration < self.stage.iterations
 
-    @property
-    def resets_opacities(self) -> bool:
-        """Whether the checkout may reset opacities: against floaters near cameras, the base's resets are enough."""
-        return self._options.residual_resets or not self.stage.signed
-
     def scene_for(self, gaussians: Any) -> Any:
         self.gaussians = gaussians
-        if self.scene_files is not None:
-            folder = Path(self._call.dataset.model_path)
-            folder.mkdir(exist_ok=True)
-            for path in self.scene_files.iterdir():
-                if path.is_file():
-                    shutil.copy(path, folder)
+        folder = Path(self._call.dataset.model_path)
+        folder.mkdir(exist_ok=True)  # not before: some checkouts refuse an output folder that is there
+        for path in filter(Path.is_file, self._run.scene_files.iterdir()):
+            shutil.copy(path, folder)
         scene = self._run.scene.copy(
             gaussians, self._call.dataset.model_path, self._views.train_views(), self._views.test_views()
         )

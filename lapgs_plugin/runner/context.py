@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -102,12 +103,19 @@ class CheckoutContext:
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Hold the objects of a run that exist once the script has called `training`."""
+    """Hold the objects of a run that exist once the script has called `training`.
+
+    Attributes:
+        call: for the whole run.
+        scene_files: folder of the files that the checkout's Scene wrote beside a model, for its viewers.
+        archive: open for writing.
+    """
 
     context: CheckoutContext
-    call: TrainingCall  # for the whole run
+    call: TrainingCall
     scene: CheckoutScene
-    archive: RunArchive  # open for writing
+    scene_files: Path
+    archive: RunArchive
     color_path: ColorPath
 
 

@@ -180,13 +180,10 @@ class HierarchyDriver:
             with self._open_archive(folder, manifest) as archive:
                 self._context.watcher.run_started(archive)
                 try:
-                    run = TrainingRun(self._context, call, scene, archive, path)
+                    run = TrainingRun(self._context, call, scene, Path(scratch), archive, path)
                     acts = "; ".join(self._schedule.describe(call.variables)) or "nowhere"
                     logger.info("%s acts by iteration: %s", self._adapter.script.path.name, acts)
-                    if self._has_residuals:
-                        returned = self._run_stages(run, plan, Path(scratch))
-                    else:
-                        returned = SingleCall(run, plan).train(Path(scratch))
+                    returned = self._run_stages(run, plan) if self._has_residuals else SingleCall(run, plan).train()
                 except KeyboardInterrupt:
                     kept = ", ".join(map(str, archive.available_levels)) or "none"
                     logger.info("stopped; finished levels in %s: %s; --resume continues after them", given, kept)
@@ -198,13 +195,8 @@ class HierarchyDriver:
         logger.info("run folder: %s; next: `lapgs eval %s`", given, shlex.quote(str(given)))
         return returned
 
-    def _run_stages(self, run: TrainingRun, plan: StagePlan, scene_files: Path) -> Any:
-        """Train or restore all stages, each by its own call, and return what the last call returned.
-
-        Args:
-            run, plan: the run.
-            scene_files: folder of the files that the Scene wrote.
-        """
+    def _run_stages(self, run: TrainingRun, plan: StagePlan) -> Any:
+        """Train or restore all stages, each by its own call, and return what the last call returned."""
         finished: list[FinishedStage] = []
         before: StageResult | None = None
         for stage in plan:
@@ -212,11 +204,7 @@ class HierarchyDriver:
             call = self._stage_call(run, window)
             active = ActiveStage(run, window, call, tuple(finished), before)
             with self._context.stages.run(active):
-                if stage.level in run.archive.available_levels:
-                    before = active.restore()
-                else:
-                    active.scene_files = scene_files
-                    before = active.train()
+                before = active.restore() if stage.level in run.archive.available_levels else active.train()
             finished.append(FinishedStage(stage, call))
         return active.returned
 

@@ -168,8 +168,8 @@ class StageReplacements:
 
         @wraps(original)
         def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-            stage = self._stages.running
-            if stage is None or stage.resets_opacities:
+            # Against floaters near cameras, the base's resets are enough.
+            if self._context.options.residual_resets or not self._in_residual():
                 return control(gaussians, *args, **kwargs)
             return None
 

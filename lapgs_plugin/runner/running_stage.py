@@ -30,11 +30,6 @@ class RunningStage(TimedLoop):
     def entered(self) -> AbstractContextManager[None]:
         """Prepare the stage, act on exceptions of what runs inside, and release what the stage holds."""
 
-    @property
-    def resets_opacities(self) -> bool:
-        """Whether the checkout may reset opacities."""
-        return True
-
     @abstractmethod
     def scene_for(self, gaussians: Any) -> Any:
         """Return the scene of this stage, and initialise `gaussians` from it."""

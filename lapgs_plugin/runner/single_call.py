@@ -99,11 +99,8 @@ class SingleCall:
         self._stage: NestedStage
         self._running = ExitStack()  # of the stage, which is another one at the end of the call than at its start
 
-    def train(self, scene_files: Path) -> Any:
+    def train(self) -> Any:
         """Call the script's `training` and return what it returned.
-
-        Args:
-            scene_files: folder of the files that the Scene wrote.
 
         Raises:
             LapgsError: it ended before the finest level, or cannot be continued in the middle.
@@ -111,7 +108,6 @@ class SingleCall:
         if not self._left:
             return None
         self._stage = self._next(self._restored(self._done[-1]) if self._done else None)
-        self._stage.scene_files = scene_files
         with self._running:
             self._begin()
             returned = self._run_from(self._stage.window.start) if self._done else self._call.run()
