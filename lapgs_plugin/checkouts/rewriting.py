@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from lapgs_plugin.checkouts.syntax import parsed_quietly
 
-FACTORY = "_lapgs_made_again"
+FACTORY = "_lapgs_recompiled"
 """Name of the function that defines the function again; what its tree calls beside its globals are its arguments."""
 
 MADE = "_lapgs_made"
@@ -62,7 +62,7 @@ def rewritten(
         return function
     found = change(tree)
     changed = found.visit(tree)
-    return made_again(function, changed, names) if found.found else function
+    return recompiled(function, changed, names) if found.found else function
 
 
 def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
@@ -101,7 +101,7 @@ def _is_private(node: ast.AST) -> bool:
     return isinstance(name, str) and name.startswith("__") and not name.endswith("__")
 
 
-def made_again(
+def recompiled(
     function: Callable[..., Any], tree: ast.FunctionDef, names: Mapping[str, Callable[..., Any]] | None = None
 ) -> Callable[..., Any]:
     """Return a function by its changed tree, with the globals and line numbers of the original.

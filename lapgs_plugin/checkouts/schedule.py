@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from lapgs_plugin.checkouts.rewriting import made_again, tree_of
+from lapgs_plugin.checkouts.rewriting import recompiled, tree_of
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 RARE = 10
@@ -368,7 +368,7 @@ class StageSchedule:
             return original
         tree = tree_of(original) or copy.deepcopy(self._function)  # if it was changed before
         rewriter = _Rewriter(self._numbers, self._moved, elsewhere, self._variable)
-        return made_again(original, rewriter.visit(tree))
+        return recompiled(original, rewriter.visit(tree))
 
 
 @dataclass

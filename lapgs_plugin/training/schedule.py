@@ -54,7 +54,7 @@ class StageSchedule:
     residuals, which start from the base's geometry or positions.
 
     Attributes:
-        gather_from, gather: from this iteration on, the gradients of so many views make one step.
+        accumulate_from, accumulate_views: from this iteration on, the gradients of so many views make one step.
         views: the same for earlier steps. A step ends early where something is due.
         extended: iterations after the `iterations` of the schedule, all as the last one is.
     """
@@ -69,8 +69,8 @@ class StageSchedule:
     means_first: float
     means_last: float
     sh_rest_factor: float
-    gather_from: int
-    gather: int
+    accumulate_from: int
+    accumulate_views: int
     before: int
     views: int = 1
     extended: int = 0
@@ -112,8 +112,8 @@ class StageSchedule:
             means_first=rates.means_first,
             means_last=rates.means_last,
             sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),
-            gather_from=stage.iterations - late + 1,
-            gather=settings.gather if late >= LEAST_STEPS * settings.gather else 1,
+            accumulate_from=stage.iterations - late + 1,
+            accumulate_views=settings.accumulate_views if late >= LEAST_STEPS * settings.accumulate_views else 1,
             before=before,
             views=views,
             extended=extended,
@@ -130,13 +130,13 @@ class StageSchedule:
 
     def gathers(self, iteration: int) -> bool:
         """Return whether the step of this iteration is a late one, which keeps the step sizes of one view."""
-        return self.gather > 1 and iteration >= self.gather_from
+        return self.accumulate_views > 1 and iteration >= self.accumulate_from
 
     def views_of_step(self, done: int) -> int:
         """Return the number of views, at least 1, of the step after `done` iterations."""
         if self.gathers(done + 1):
-            within = (done + 1 - self.gather_from) % self.gather
-            return min(self.gather - within, self.end - done)
+            within = (done + 1 - self.accumulate_from) % self.accumulate_views
+            return min(self.accumulate_views - within, self.end - done)
         return 1 if self.views == 1 else min(self.views, self._next_due(done) - done)
 
     def _next_due(self, done: int) -> int:
@@ -146,8 +146,8 @@ class StageSchedule:
             # Statistics are collected before iteration `densify_until`, and pruning follows it.
             due += [(done // every + 1) * every for every in (self.densify_every, self.reset_every)]
             due += [self.densify_until - 1, self.densify_until]
-        if self.gather > 1:
-            due.append(self.gather_from - 1)
+        if self.accumulate_views > 1:
+            due.append(self.accumulate_from - 1)
         return min(each for each in (*due, *self.late_prunes) if each > done)
 
     @property
@@ -163,7 +163,7 @@ class StageSchedule:
         for tenth in range(6, 10):
             due = max(round(self.iterations * tenth / 10), self.densify_until + 1)
             if self.gathers(due):
-                due += (self.gather_from - 1 - due) % self.gather
+                due += (self.accumulate_from - 1 - due) % self.accumulate_views
             found.add(due)
         return frozenset(due for due in found if due < self.iterations)
 

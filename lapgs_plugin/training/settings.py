@@ -162,12 +162,11 @@ class TrainSettings(HierarchySettings):
         f"{REFERENCE_ITERATIONS // PASSES} training photos get {PASSES} for each, but at least {LONG_RUN}.",
         least=1,
     )
-    gather: int = option(
+    accumulate_views: int = option(
         8,
         "Views whose gradients are added up for each optimizer step in the last quarter of a stage, once densification "
         "has ended and if 40 such steps fit; 1 steps after every view, as 3DGS does.",
         panel=SCHEDULE,
-        names=("--accumulate-views",),
         least=1,
     )
     views_per_step: str = option(
@@ -409,7 +408,13 @@ class TrainSettings(HierarchySettings):
         """See `HierarchySettings.paper_settings`."""
         return {
             **super().paper_settings,
-            **{"gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0, "exposure": OFF, "refine_poses": False},
+            **{
+                "accumulate_views": 1,
+                "views_per_step": "1",
+                "sh_rate_factor": 1.0,
+                "exposure": OFF,
+                "refine_poses": False,
+            },
             "dropout": 0.0,
         }
 

@@ -157,7 +157,7 @@ def test_the_schedule_goes_on_as_it_ended() -> None:
         steps.append(longer.views_of_step(done))
         done += steps[-1]
     assert done == 5001
-    assert set(steps[-100:-1]) == {calm.gather}
+    assert set(steps[-100:-1]) == {calm.accumulate_views}
     assert all(4000 < each <= 5001 for each in longer.sampled(4))
 
 

@@ -160,7 +160,7 @@ def test_refinement_finds_true_poses_and_sharpens_held_out_views(
     scene = perturbed(truth, 0.03)
     psnr, shift = {}, {}
     for refine in (False, True):
-        settings = TrainSettings(iterations=700, levels=1, sh_degree=0, gather=1, refine_poses=refine)
+        settings = TrainSettings(iterations=700, levels=1, sh_degree=0, accumulate_views=1, refine_poses=refine)
         archive = train(tmp_path / str(refine), scene, settings)
         psnr[refine], shift[refine] = archive.history()[-1]["psnr"], shift_of_points(scene, truth, archive)
     assert shift[False] == shift_of_points(scene, truth) > 1.0

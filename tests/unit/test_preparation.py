@@ -78,7 +78,7 @@ def test_what_needs_no_photos_is_refused_before_they_are_read(
 def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> None:
     """The request of a run that continues has other defaults; the run keeps its own."""
     photos = SceneOptions(resolution="1/2", eval=True)
-    first = TrainRequest(folder, tmp_path / "run", replace(SHORT, keep="best", gather=2), photos)
+    first = TrainRequest(folder, tmp_path / "run", replace(SHORT, keep="best", accumulate_views=2), photos)
     whole = trained(replace(first, out=tmp_path / "whole"))
     with pytest.raises(TrainingStoppedError):
         trained(first, StopAt(0, 11))
@@ -89,7 +89,7 @@ def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> 
         trained(replace(again, given=frozenset({"resolution"})))
     with prepare(again) as run, pytest.raises(RunFolderError, match="is being written by process"), prepare(again):
         pass
-    assert (run.resumes, run.settings.gather, run.plan[0].image_size) == (True, 2, (32, 24))
+    assert (run.resumes, run.settings.accumulate_views, run.plan[0].image_size) == (True, 2, (32, 24))
     assert (len(run.scene.train), len(run.aside), len(run.scene.test)) == (12, 2, 2)
     assert plys(trained(again)) == plys(whole)
     longer = trained(replace(again, settings=TrainSettings(iterations=24)))

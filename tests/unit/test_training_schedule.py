@@ -77,16 +77,16 @@ def test_given_constants_are_kept_in_short_runs() -> None:
 def test_late_in_a_stage_eight_views_make_a_step() -> None:
     base, residual = schedules(iterations=30_000)
     for schedule in (base, residual):
-        assert (schedule.gather_from, schedule.gather) == (11_251, 8)
+        assert (schedule.accumulate_from, schedule.accumulate_views) == (11_251, 8)
         stepping = steps(schedule)
         assert stepping[:11_250] == list(range(1, 11_251))
         assert stepping[11_250:11_253] == [11_258, 11_266, 11_274]
         assert stepping[-1] == 15_000
-    assert schedules(iterations=3000)[1].gather == 8
-    assert schedules(iterations=2560)[1].gather == 8  # 40 steps of the last 320 iterations
-    assert schedules(iterations=2550)[1].gather == 1
-    assert schedules(iterations=2550, split="1/2,1/2", gather=4)[1].gather == 4
-    assert all(schedule.gather == 1 for schedule in schedules(gather=1))
+    assert schedules(iterations=3000)[1].accumulate_views == 8
+    assert schedules(iterations=2560)[1].accumulate_views == 8  # 40 steps of the last 320 iterations
+    assert schedules(iterations=2550)[1].accumulate_views == 1
+    assert schedules(iterations=2550, split="1/2,1/2", accumulate_views=4)[1].accumulate_views == 4
+    assert all(schedule.accumulate_views == 1 for schedule in schedules(accumulate_views=1))
 
 
 def test_pruning_waits_for_the_end_of_densification() -> None:
@@ -134,7 +134,7 @@ def test_a_stage_that_densifies_to_its_end_gathers_nothing(until: int) -> None:
 @pytest.mark.parametrize("strategy", ["3dgs", "mcmc"])
 def test_steps_for_several_views_end_where_something_is_due(views: int, strategy: str) -> None:
     density = Densification(until=3333, every=70, reset_every=None if strategy == "mcmc" else 1100, strategy=strategy)
-    settings = TrainSettings(iterations=6000, densification=density, gather=5)
+    settings = TrainSettings(iterations=6000, densification=density, accumulate_views=5)
     (stage,) = StagePlan.create((1600, 1066), 6000, 1)
     schedule = StageSchedule.create(settings, stage, views=views)
     stepping = steps(schedule)
@@ -211,7 +211,7 @@ def test_the_rate_of_higher_harmonics_follows_the_views_and_falls(
 PAPER = {
     **{"hierarchy": "laplacian", "split": "1/3,2/3", "inherit": "xyz", "supervision": "reconstructed", "joint": 0.0},
     **{"residual_color_rate": 1.0, "residual_resets": True, "residual_threshold": 1.0, "coarse_threshold": 1.0},
-    **{"prune": 0.0, "gather": 1, "views_per_step": "1", "sh_rate_factor": 1.0},
+    **{"prune": 0.0, "accumulate_views": 1, "views_per_step": "1", "sh_rate_factor": 1.0},
 }
 
 
@@ -227,10 +227,10 @@ def test_the_papers_protocol_is_the_papers_settings_and_nothing_else() -> None:
     others: dict[str, Any] = {
         **{"hierarchy": "nested", "split": "1/2,1/2", "inherit": "geometry", "supervision": "gt_laplacian"},
         **{"joint": 0.5, "residual_color_rate": 4.0, "residual_threshold": 2.0, "coarse_threshold": 2.0, "prune": 0.1},
-        **{"gather": 4, "views_per_step": "8", "sh_rate_factor": 8.0},
+        **{"accumulate_views": 4, "views_per_step": "8", "sh_rate_factor": 8.0},
     }
     for name, value in others.items():
-        shown = "accumulate-views" if name == "gather" else name.replace("_", "-")
+        shown = name.replace("_", "-")
         with pytest.raises(UserInputError, match=f"--{shown} {value} with --protocol paper"):
             TrainSettings(protocol="paper", **{name: value})
     with pytest.raises(UserInputError, match="--protocol papers: expected default or paper"):
@@ -354,7 +354,7 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"coarse_threshold": math.inf}, "--coarse-threshold inf: expected a positive factor"),
         ({"residual_color_rate": 0.0}, "--residual-color-rate 0.0: expected a positive factor"),
         ({"split": "half,half"}, "--split 'half,half': expected fractions"),
-        ({"gather": -1}, "--accumulate-views -1: expected at least 1"),
+        ({"accumulate_views": -1}, "--accumulate-views -1: expected at least 1"),
         ({"hierarchy": "nested", "residual_threshold": 2.0}, "--residual-threshold 2.0: is about residuals"),
         (
             {"densification": Densification(strategy="3dgs", options=Gradients(grow_grad2d=-1.0))},

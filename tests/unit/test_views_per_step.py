@@ -287,7 +287,7 @@ def test_steps_for_several_views_are_adams_with_scaled_rates(adam: str, monkeypa
 
 def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_path: Path) -> None:
     """With base and residual, joint training, gathered views, and an SH degree that rises within steps."""
-    settings = replace(SETTINGS, iterations=340, joint=0.1, gather=2, sh_every=50)
+    settings = replace(SETTINGS, iterations=340, joint=0.1, accumulate_views=2, sh_every=50)
     batching = Batching()
     runs = [
         train(tmp_path / name, scene, settings, each, test_every=1)
@@ -320,7 +320,11 @@ def test_regularization_counts_for_each_view_of_a_step(
     for weight in (0.0, 0.25):
         options = Gradients(opacity_regularization=weight, scale_regularization=2 * weight)
         settings = replace(
-            SETTINGS, iterations=40, levels=1, gather=1, densification=Densification(GRADIENTS, options=options)
+            SETTINGS,
+            iterations=40,
+            levels=1,
+            accumulate_views=1,
+            densification=Densification(GRADIENTS, options=options),
         )
         train(tmp_path / str(weight), scene, settings, Batching(holds))
         found = seen[0]
@@ -359,7 +363,9 @@ def test_two_views_a_step_learn_what_one_learns(tmp_path: Path) -> None:
     calm = Densification(start=20, until=200, every=20, reset_every=10_000)
     found = {}
     for views in (1, 2):
-        settings = replace(SETTINGS, levels=1, iterations=400, gather=1, views_per_step=str(views), densification=calm)
+        settings = replace(
+            SETTINGS, levels=1, iterations=400, accumulate_views=1, views_per_step=str(views), densification=calm
+        )
         archive = train(tmp_path / str(views), scene, settings)
         found[views] = archive.history()[-1]["loss"]
         first = archive.history()[0]["loss"]
@@ -467,7 +473,7 @@ def test_launches_stay_small_where_images_are_large(
 ) -> None:
     monkeypatch.setattr("lapgs_plugin.training.stage.PIXELS_OF_A_LAUNCH", 3 * 56 * 40)
     settings = replace(
-        SETTINGS, levels=1, views_per_step="4", iterations=8, gather=1, densification=Densification(until=0)
+        SETTINGS, levels=1, views_per_step="4", iterations=8, accumulate_views=1, densification=Densification(until=0)
     )
     batching = Batching()
     train(tmp_path / "run", scene, settings, batching)
