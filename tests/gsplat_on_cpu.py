@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,10 +19,9 @@ from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected, records_of
+from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected, grid_of, records_of
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -219,16 +218,6 @@ def gsplat_on_cpu() -> Iterator[None]:
         yield
 
 
-class Compiled:
-    """These kernels as gsplat's compiled module has them."""
-
-    class CameraModelType:
-        PINHOLE = "CameraModelType.PINHOLE"
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        return _checked(name)
-
-
 def _looks(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool) -> tuple[Tensor, Tensor]:
     """Colours (c, n, 3) and opacities (c, n)."""
     away = [torch.nn.functional.normalize(given.means - centre, dim=-1) for centre in cameras.centres]
@@ -282,15 +271,44 @@ def project_backward(
     return Parameters(*torch.autograd.grad(total, leaves))
 
 
+def sort_by_depth(radii: Tensor, means2d: Tensor, depths: Tensor, grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """As `tile_kernels.sort_by_depth`; Gaussians stay in their order, of which `sort_by_tile` makes no use."""
+    images = torch.zeros(depths.numel(), dtype=torch.int64)
+    counts, *_ = _intersect(
+        means2d.view(-1, 2), radii.view(-1, 2), depths.view(-1), images, images, 1, 16, *grid, True, False
+    )
+    return depths.view(-1), counts.cumsum(0)
+
+
+def sort_by_tile(
+    radii: Tensor, means2d: Tensor, depths: Tensor, ends: Tensor, images: Tensor | None, count: int,
+    grid: tuple[int, int], room: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """As `tile_kernels.sort_by_tile`; takes depths in the place of their order."""
+    if images is None:
+        images = torch.arange(count).repeat_interleave(len(depths) // count)
+    _, keys, flat = _intersect(
+        means2d.view(-1, 2), radii.view(-1, 2), depths, images, images, count, 16, *grid, True, False
+    )
+    offsets = torch.cat([_offsets(keys, count, *grid).flatten(), torch.tensor([len(keys)])])
+    return offsets.clamp_max(room), torch.nn.functional.pad(flat[:room], (0, max(0, room - len(flat))))
+
+
 def _parts(records: Tensor) -> list[Tensor]:
     return [records[..., part].contiguous() for part in (slice(2), slice(2, 5), slice(8, 11), 5)]
 
 
+def _pairs(offsets: Tensor, flat: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Offsets and Gaussians as gsplat's kernels take them."""
+    across, down = grid_of(size)
+    return offsets[:-1].view(-1, down, across), flat[: int(offsets[-1])]
+
+
 def blend_forward(
-    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int]
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `blend_kernels.blend_forward`; what it keeps for the backward pass is another thing."""
-    images, alphas, _ = _blend(*_parts(records), None, None, *size, 16, offsets, flat)
+    images, alphas, _ = _blend(*_parts(records), None, None, *size, 16, *_pairs(offsets, flat, size))
     backgrounds = background.expand(len(images), -1).contiguous()
     return images + (1 - alphas) * backgrounds[:, None, None], alphas, backgrounds
 
@@ -301,7 +319,17 @@ def blend_backward(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """As `blend_kernels.blend_backward`; absolute gradients are those of sums."""
     size = images.shape[2], images.shape[1]
-    rest = None, *size, 16, offsets, flat, alphas, torch.empty(0), by_images, torch.zeros_like(alphas), absolute
+    rest = (
+        None,
+        *size,
+        16,
+        *_pairs(offsets, flat, size),
+        alphas,
+        torch.empty(0),
+        by_images,
+        torch.zeros_like(alphas),
+        absolute,
+    )
     whole, means2d, conics, colors, opacities = _blend_back(*_parts(records), backgrounds, *rest)
     found = torch.cat([colors, opacities[..., None], means2d, conics[..., :2]], -1)
     return found, torch.cat([conics[..., 2:], *([] if whole is None else [whole])], -1)
@@ -309,6 +337,7 @@ def blend_backward(
 
 KERNEL_MODULES = {
     "kernels": {"project": project, "project_into": project_into, "project_backward": project_backward},
+    "tile_kernels": {"sort_by_depth": sort_by_depth, "sort_by_tile": sort_by_tile},
     "blend_kernels": {"blend_forward": blend_forward, "blend_backward": blend_backward},
 }
 """Functions by the modules of Triton kernels that they replace."""
@@ -318,8 +347,6 @@ KERNEL_MODULES = {
 def direct_on_cpu(**others: Callable[..., Any]) -> Iterator[None]:
     """Let `gsplat.direct` find these kernels, and these functions in place of our kernels, or others by their names."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bindings, "compiled_functions", Compiled)
-        patch.setattr(torch.cuda, "device", lambda device: nullcontext())
         for name, functions in KERNEL_MODULES.items():
             chosen = {key: others.get(key, function) for key, function in functions.items()}
             patch.setitem(sys.modules, f"lapgs_plugin.rasterizers.gsplat.{name}", SimpleNamespace(**chosen))

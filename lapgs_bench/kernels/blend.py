@@ -16,9 +16,9 @@ from lapgs_bench.kernels.random_scene import make_scene
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.rasterizers.gsplat import bindings, direct
+from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, Parameters
+from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, TILE, Parameters, grid_of
 from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
@@ -78,10 +78,8 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
         if not 1 <= len(numbers) <= 2 or any(number < 1 or number & (number - 1) for number in numbers):
             raise UserInputError(f"--shapes {entry!r}: expected one or two powers of 2 such as 4x2")
         shape = blend_kernels.Shape(*numbers)
-        if not 2 <= shape.rows <= bindings.TILE or shape.splats > 2:
-            raise UserInputError(
-                f"--shapes {entry!r}: expected ROWS[xSPLATS] with 2 to {bindings.TILE} ROWS and 1 or 2 SPLATS"
-            )
+        if not 2 <= shape.rows <= TILE or shape.splats > 2:
+            raise UserInputError(f"--shapes {entry!r}: expected ROWS[xSPLATS] with 2 to {TILE} ROWS and 1 or 2 SPLATS")
         shapes[entry.strip()] = shape
     return shapes
 
@@ -120,11 +118,17 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
 
 def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
     """Return gsplat's, which take the numbers of a Gaussian one by one."""
-    compiled, none = bindings.compiled_functions(), given.records.new_zeros(len(given.records), size[1], size[0], 1)
+    from gsplat.cuda._backend import _C as compiled
+
+    none = given.records.new_zeros(len(given.records), size[1], size[0], 1)
     color = slice(COLOR_IN_RECORD, COLOR_IN_RECORD + 3)
     parts = [given.records[..., part].contiguous() for part in (slice(2), slice(2, 5), color, 5)]
     background = given.background.expand(len(given.records), -1).contiguous()
-    taken = *parts, background, None, *size, bindings.TILE, given.offsets, given.flat
+    across, down = grid_of(size)
+    all_tiles = len(given.records) * down * across
+    flat = given.flat[: int(given.offsets[all_tiles])] if len(given.offsets) > all_tiles else given.flat
+    offsets = given.offsets[:all_tiles].view(-1, down, across)
+    taken = *parts, background, None, *size, TILE, offsets, flat
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         found: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(*taken, *blended[1:], by_images, none, False)
@@ -146,7 +150,7 @@ def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
         first, rest = found
         return first[..., 4:6], torch.cat([first[..., 6:], rest[..., :1]], -1), first[..., :3], first[..., 3]
 
-    return Kernels(partial(blend_forward, *given, size, shape), backward, parts)
+    return Kernels(partial(blend_forward, *given, size, len(given.records), shape), backward, parts)
 
 
 def time_kernels(

@@ -160,6 +160,7 @@ def blend(
     from lapgs_bench.kernels.blend import parse_shapes, random_views, time_kernels, views_around
     from lapgs_bench.kernels.raster import parse_cases
     from lapgs_plugin.fields.gaussian_field import GaussianField
+    from lapgs_plugin.rasterizers.gsplat.rasterizer import gsplat_missing
 
     counts = [int(number) if number.strip().isdecimal() else 0 for number in views.split(",")]
     if min(counts) < 1:
@@ -169,6 +170,8 @@ def blend(
         raise UserInputError("lapgs bench blend: PyTorch finds no CUDA device; `lapgs doctor` says why")
     if find_spec("triton") is None:
         raise UserInputError("lapgs bench blend: Triton is not installed; it comes with PyTorch for CUDA on Linux")
+    if reason := gsplat_missing():
+        raise UserInputError(f"lapgs bench blend compares with gsplat: {reason}; `lapgs doctor` says more")
     parsed = parse_shapes(shapes)
     table = _titled_table(
         f"Blending on {torch.cuda.get_device_name()}, ms for one view",

@@ -93,6 +93,7 @@ def examine() -> dict[str, list[Finding]]:
         "Extras": findings.extra_findings(requirements),
         "Entry points of other packages": findings.entry_point_findings(),
         "Backbones": [
+            findings.triton_finding(torch),
             findings.gsplat_finding(torch, nvcc=compilers[0].status == "ok"),
             *(extension.result() for extension in extensions),
             *(adapters or [current_folder(Path.cwd(), bool(torch.facts.get("gpus")))]),
@@ -153,10 +154,11 @@ def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Findin
     if broken == ["GPU"]:
         advice += f"; {ON_THE_CPU}"
     if not broken and torch.facts["gpus"]:
-        gsplat = sections["Backbones"][0]
-        if gsplat.status == "ok":
-            return [Finding("will use", "ok", f"gsplat on the GPU, {torch.facts['gpus'][0]}")]
-        broken, advice = [gsplat.name], f"{gsplat.advice or gsplat.detail}; {ON_THE_CPU}"
+        triton, gsplat = sections["Backbones"][:2]
+        for rasterizer, what in ((triton, "our kernels"), (gsplat, "gsplat")):
+            if rasterizer.status == "ok":
+                return [Finding("will use", "ok", f"{what} on the GPU, {torch.facts['gpus'][0]}")]
+        broken, advice = [triton.name], f"{triton.advice}; {ON_THE_CPU}"
     if broken:
         return [Finding("will use", "problem", f"nothing until this is fixed: {', '.join(broken)}", advice)]
     return [Finding("will use", "ok", f"the CPU rasterizer, {sections['CPU rasterizer'][0].detail}")]

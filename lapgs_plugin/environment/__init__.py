@@ -6,8 +6,10 @@ import importlib.util
 import os
 import platform
 import re
+import shutil
 import signal
 import subprocess
+import sysconfig
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -77,6 +79,20 @@ def gsplat_built() -> bool | None:
     if spec is None or not spec.submodule_search_locations:
         return None
     return any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
+
+
+def triton_missing() -> str:
+    """Return what Triton lacks to start kernels on a GPU, as a clause; empty if nothing. Imports and compiles nothing.
+
+    Triton has a compiler for kernels with it. What starts them is a small C program for each, which a C compiler makes.
+    """
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    if not any(map(shutil.which, (os.environ.get("CC", "gcc"), "gcc", "clang"))):
+        return "there is no C compiler for Triton (gcc, clang or CC)"
+    scheme = sysconfig.get_default_scheme().replace("posix_local", "posix_prefix")  # as Triton looks for it
+    header = Path(sysconfig.get_path("include", scheme), "Python.h")
+    return "" if header.is_file() else f"Triton needs Python's headers to compile C, and there is no {header}"
 
 
 _running: set[subprocess.Popen[str]] = set()

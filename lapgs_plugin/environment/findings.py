@@ -16,7 +16,14 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from lapgs_plugin.environment import PACKAGE, gsplat_built, installed_version, processor_name, run_program
+from lapgs_plugin.environment import (
+    PACKAGE,
+    gsplat_built,
+    installed_version,
+    processor_name,
+    run_program,
+    triton_missing,
+)
 from lapgs_plugin.environment.probes import Probe, run_probe
 from lapgs_plugin.errors import counted, typed_line
 from lapgs_plugin.limits import usable_processors
@@ -216,7 +223,7 @@ def _applies(requirement: Requirement, extra: str) -> bool:
 
 
 def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:
-    """Report whether gsplat's CUDA part can be used. Its Python part is listed with the packages."""
+    """Report whether gsplat's CUDA part can be used, which is optional. Its Python part is listed with the packages."""
     built = gsplat_built()
     if built is None:
         return Finding("gsplat CUDA part", "absent", "gsplat is not installed")
@@ -229,7 +236,18 @@ def gsplat_finding(torch: Probe, nvcc: bool) -> Finding:
         state = f"built at its first use ({builds[0]})" if builds else "not built yet; gsplat compiles it at first use"
         return Finding("gsplat CUDA part", "ok", state if builds else f"{state}, which takes minutes")
     advice = "install the CUDA toolkit, or a gsplat wheel built for this PyTorch"
-    return Finding("gsplat CUDA part", "problem", "not built, and there is no nvcc to compile it", advice)
+    detail = "not built, and there is no nvcc to compile it; --packed and --antialiased need it, and all without Triton"
+    return Finding("gsplat CUDA part", "absent", detail, advice)
+
+
+def triton_finding(torch: Probe) -> Finding:
+    """Report whether Triton can start our kernels on a GPU."""
+    if torch.error or not torch.facts["gpus"]:
+        return Finding("Triton", "absent", "PyTorch sees no GPU to use it on")
+    if missing := triton_missing():
+        advice = "install PyTorch for CUDA, which brings Triton, a C compiler and Python's headers (python3-dev)"
+        return Finding("Triton", "problem", missing, advice)
+    return Finding("Triton", "ok", f"{installed_version('triton')}, with a C compiler for what starts kernels")
 
 
 def extension_finding(module: str, purpose: str) -> Finding:

@@ -67,11 +67,11 @@ def _probe_torch() -> dict[str, Any]:
         "cuda": torch.version.cuda,
         "gpus": gpus,
         "complaint": complaint,
-        "extensions": _extensions_folder(),
+        "extensions": extensions_folder(),
     }
 
 
-def _extensions_folder() -> str:
+def extensions_folder() -> str:
     """Return where PyTorch keeps extensions that it compiled, as `cpp_extension.load` chooses it."""
     import torch
     from torch.utils.cpp_extension import get_default_build_root

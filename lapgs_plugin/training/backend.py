@@ -1,4 +1,4 @@
-"""Choose the rasterizer and the device of a run: gsplat on a GPU, our own on a CPU."""
+"""Choose the rasterizer and the device of a run: our kernels or gsplat on a GPU, the CPU rasterizer without one."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MINUTES_ON_A_CPU = "--resolution 1/4 --iterations 3000"
 def choose_rasterizer(name: str) -> str:
     """Return the rasterizer that `--rasterizer auto` means on this machine; any other name is returned unchanged.
 
-    With a GPU it is gsplat or an error, so that a run does not leave the GPU idle unnoticed. An empty
-    CUDA_VISIBLE_DEVICES, or -1, hides the GPU.
+    With a GPU it is gsplat, whose place our kernels take where they can, or an error, so that a run does not leave the
+    GPU idle unnoticed. An empty CUDA_VISIBLE_DEVICES, or -1, hides the GPU.
 
     Raises:
-        MissingExtraError: there is a GPU, and PyTorch or gsplat cannot use it.
+        MissingExtraError: there is a GPU, and PyTorch, or both Triton and gsplat, cannot use it.
         UserInputError: an unknown name.
     """
     known = (AUTO, *RASTERIZERS)
@@ -60,6 +60,8 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
     """
     name = choose_rasterizer(name)
     if name == gsplat.NAME:
+        if settings.sparse_adam and torch.cuda.is_available() and (reason := gsplat.gsplat_missing()):
+            raise MissingExtraError(f"--sparse-adam is gsplat's: {reason}; `lapgs doctor` says more, or leave it out")
         rasterizer = gsplat.GsplatRasterizer(
             antialiasing=settings.antialiased,
             packed=settings.packed,

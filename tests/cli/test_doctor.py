@@ -79,21 +79,24 @@ GPU = "NVIDIA H200, 140 GiB"
 
 
 @pytest.mark.parametrize(
-    ("facts", "driver", "built", "hidden", "status", "detail"),
+    ("facts", "driver", "triton", "built", "hidden", "status", "detail"),
     [
-        ({"gpus": [GPU]}, "580.1", True, None, "ok", f"gsplat on the GPU, {GPU}"),
-        ({"gpus": [GPU]}, "580.1", None, None, "problem", "nothing until this is fixed: gsplat CUDA part"),
-        ({"gpus": [GPU]}, "580.1", False, None, "problem", "nothing until this is fixed: gsplat CUDA part"),
-        ({"complaint": "too old"}, "470.1", True, None, "problem", "nothing until this is fixed: GPU"),
-        ({"cuda": None}, "580.1", True, None, "problem", "nothing until this is fixed: GPU"),
-        ({"complaint": "no device"}, "580.1", True, "", "ok", "the CPU rasterizer"),
-        ({}, "", True, None, "ok", "the CPU rasterizer"),
+        ({"gpus": [GPU]}, "580.1", "", None, None, "ok", f"our kernels on the GPU, {GPU}"),
+        ({"gpus": [GPU]}, "580.1", "", False, None, "ok", f"our kernels on the GPU, {GPU}"),
+        ({"gpus": [GPU]}, "580.1", "no Triton", True, None, "ok", f"gsplat on the GPU, {GPU}"),
+        ({"gpus": [GPU]}, "580.1", "no Triton", None, None, "problem", "nothing until this is fixed: Triton"),
+        ({"gpus": [GPU]}, "580.1", "no Triton", False, None, "problem", "nothing until this is fixed: Triton"),
+        ({"complaint": "too old"}, "470.1", "", True, None, "problem", "nothing until this is fixed: GPU"),
+        ({"cuda": None}, "580.1", "", True, None, "problem", "nothing until this is fixed: GPU"),
+        ({"complaint": "no device"}, "580.1", "", True, "", "ok", "the CPU rasterizer"),
+        ({}, "", "", True, None, "ok", "the CPU rasterizer"),
     ],
 )
 def test_what_training_will_use(
     monkeypatch: pytest.MonkeyPatch,
     facts: dict[str, Any],
     driver: str,
+    triton: str,
     built: bool | None,
     hidden: str | None,
     status: str,
@@ -104,6 +107,7 @@ def test_what_training_will_use(
     monkeypatch.setattr(probes, "run_probe", lambda *given: found if given == ("torch",) else probed(*given))
     monkeypatch.setattr(environment, "driver_version", lambda: driver)
     monkeypatch.setattr(findings, "gsplat_built", lambda: built)
+    monkeypatch.setattr(findings, "triton_missing", lambda: triton)
     monkeypatch.setattr(findings.shutil, "which", lambda name, path=None: None)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if hidden is not None:
@@ -139,4 +143,4 @@ def test_what_gsplat_compiled_at_its_first_use_is_built(
     library = Path(_get_build_directory("gsplat_cuda", verbose=False), "gsplat_cuda.so")  # where gsplat builds it
     library.touch()
     assert findings.gsplat_finding(torch, nvcc=True).detail == f"built at its first use ({library})"
-    assert findings.gsplat_finding(torch, nvcc=False).status == "problem"  # gsplat does not load it then
+    assert findings.gsplat_finding(torch, nvcc=False).status == "absent"  # gsplat does not load it then

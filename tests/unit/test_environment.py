@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from lapgs_plugin import environment
 from lapgs_plugin.cli.doctor import current_folder
 from lapgs_plugin.environment import findings, probes
 from lapgs_plugin.environment.findings import Finding
@@ -170,3 +171,21 @@ def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_
     found = current_folder(tmp_path, has_gpu=False)
     assert found.detail.startswith(f"a checkout of {name}" if name else "not a known 3DGS checkout")
     assert ("lapgs run" in found.detail) == (name not in (None, "gsplat"))
+
+
+def test_what_triton_needs_to_start_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = tmp_path / "gcc"
+    compiler.touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(environment.sysconfig, "get_path", lambda name, scheme: str(tmp_path))
+    monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: None)
+    assert environment.triton_missing() == "Triton is not installed"
+    monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: name)
+    assert environment.triton_missing().endswith(f"there is no {tmp_path / 'Python.h'}")
+    (tmp_path / "Python.h").touch()
+    assert environment.triton_missing() == ""
+    compiler.rename(tmp_path / "other")
+    assert environment.triton_missing() == "there is no C compiler for Triton (gcc, clang or CC)"
+    monkeypatch.setenv("CC", str(tmp_path / "other"))
+    assert environment.triton_missing() == ""

@@ -169,14 +169,14 @@ def test_a_build_that_lacks_a_setting_says_so(line: Any) -> None:
 
 @pytest.mark.usefixtures("cuda")
 def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: Any) -> None:
-    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda **options: "")
     placed = rasterizer_for(manifest(FASTGS, mult=0.5))
     assert chosen(placed) == ("gsplat", "cuda")
     assert placed.unsupported == {"mult": 0.5}
     assert f"rendering with gsplat on A GPU: {FASTGS} cannot be imported" in line()
     assert rasterizer_for(manifest(GRAPHDECO, antialiasing=True)).unsupported == {}
 
-    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "gsplat is not installed")
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda **options: "gsplat is not installed")
     assert chosen(rasterizer_for(manifest(FASTGS))) == ("cpu", "cpu")
     with pytest.raises(MissingExtraError, match=r"--device cuda: .*cannot be imported.* and gsplat is not installed"):
         rasterizer_for(manifest(FASTGS), device="cuda")
@@ -184,7 +184,7 @@ def test_gsplat_is_next_and_the_cpu_last(monkeypatch: pytest.MonkeyPatch, line: 
 
 @pytest.mark.usefixtures("cuda")
 def test_the_device_decides_for_runs_of_either_kind(monkeypatch: pytest.MonkeyPatch, line: Any) -> None:
-    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda **options: "")
     assert chosen(rasterizer_for(manifest("cpu"), device="cuda")) == ("gsplat", "cuda")
     assert "with gsplat on A GPU: --rasterizer cpu renders on cpu, not on --device cuda; the run was" in line()
     assert chosen(rasterizer_for(manifest("cpu"))) == ("cpu", "cpu")
@@ -406,6 +406,46 @@ def test_fields_whose_coefficients_32_bits_cannot_number_are_left_to_gsplat(
     rasterizer = GsplatRasterizer("cpu")
     rasterizer._may_be_direct = True
     assert rasterizer._calls_kernels(field) is direct
+
+
+@pytest.mark.parametrize(
+    ("triton", "gsplats", "options", "lacks"),
+    [
+        ("", "no nvcc", {}, ""),
+        ("no Triton", "", {}, ""),
+        ("no Triton", "no nvcc", {}, "no Triton and no nvcc"),
+        ("", "no nvcc", {"packed": True}, "--packed and --antialiased need gsplat's CUDA part: no nvcc"),
+        ("", "no nvcc", {"antialiasing": True}, "--packed and --antialiased need gsplat's CUDA part: no nvcc"),
+        ("", "no nvcc", {"direct": False}, "no nvcc"),
+    ],
+)
+def test_a_gpu_needs_triton_or_gsplats_cuda_part(
+    triton: str, gsplats: str, options: dict[str, bool], lacks: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat_adapter, "triton_missing", lambda: triton)
+    monkeypatch.setattr(gsplat_adapter, "gsplat_missing", lambda: gsplats)
+    if lacks:
+        with pytest.raises(MissingExtraError, match=f"^--rasterizer gsplat: {lacks}; `lapgs doctor` says what to"):
+            GsplatRasterizer(**options)
+    else:
+        rasterizer = GsplatRasterizer(**options)
+        assert rasterizer.can_stack
+
+
+def test_kernels_that_fail_their_validation_leave_a_line_where_gsplat_cannot_take_their_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat_adapter, "triton_missing", lambda: "")
+    monkeypatch.setattr(gsplat_adapter, "gsplat_missing", lambda: "there is no nvcc")
+    monkeypatch.setattr(gsplat_adapter, "direct_works", lambda: False)
+    with pytest.raises(
+        MissingExtraError, match=r"our kernels do not work here \(the log says why\), and there is no nv"
+    ):
+        GsplatRasterizer()._calls_kernels(faint(False).field)
+    monkeypatch.setattr(gsplat_adapter, "gsplat_missing", lambda: "")
+    assert not GsplatRasterizer()._calls_kernels(faint(False).field)
 
 
 def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: WithoutCuda) -> None:

@@ -77,12 +77,15 @@ def test_gsplat_trains_if_there_is_a_gpu_and_nothing_falls_back_silently(monkeyp
     with pytest.raises(MissingExtraError, match="PyTorch finds no CUDA device"):
         training_rasterizer("gsplat", SETTINGS)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "there is no nvcc")
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda **options: "there is no nvcc")
     with pytest.raises(MissingExtraError, match=r"there is no nvcc.*--rasterizer cpu does without"):
         choose_rasterizer("auto")
     assert choose_rasterizer("cpu") == "cpu"
-    monkeypatch.setattr(gsplat_adapter, "missing", lambda: "")
+    monkeypatch.setattr(gsplat_adapter, "missing", lambda **options: "")
     assert choose_rasterizer("auto") == "gsplat"
+    monkeypatch.setattr(gsplat_adapter, "gsplat_missing", lambda: "there is no nvcc")
+    with pytest.raises(MissingExtraError, match=r"--sparse-adam is gsplat's: there is no nvcc; .*leave it out"):
+        training_rasterizer("gsplat", replace(SETTINGS, sparse_adam=True))
     placed = training_rasterizer("gsplat", SETTINGS)
     assert (placed.rasterizer.name, placed.device.type) == ("gsplat", "cuda")
 

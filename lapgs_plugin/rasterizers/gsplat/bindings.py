@@ -1,47 +1,55 @@
-"""Call gsplat's compiled functions, with the conventions of the 3DGS family."""
+"""Sort Gaussians into tiles by gsplat's compiled functions, where they are built already."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-TILE = 16
+from lapgs_plugin.environment import gsplat_built, installed_version
+from lapgs_plugin.environment.probes import extensions_folder
+from lapgs_plugin.rasterizers.gsplat.records import TILE, grid_of
+
+KNOWN_RELEASES = "1.5."
+"""Releases of gsplat whose compiled functions have the signatures that are used here."""
 
 
-def sort_into_tiles(
-    projected: Sequence[Tensor], size: tuple[int, int], count: int = 1, of_image: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def sort_by_gsplat(
+    compiled: Any, radii: Tensor, means2d: Tensor, depths: Tensor, images: Tensor | None, count: int,
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Sort Gaussians into tiles, front to back. This waits for the GPU, for the number of pairs with tiles.
 
     Args:
-        projected: radii (c, n, 2), centres (c, n, 2) and depths (c, n); or, without the leading dimension, those of
-            several images in one list.
-        size: (width, height) of all images.
-        count: number of images.
-        of_image: in a list, the image number (n,) of each Gaussian.
+        compiled: gsplat's module.
+        radii, means2d, depths, images, count, size: as `tiles.blend_in_tiles` takes them.
 
     Returns:
-        The first pair of each tile, (count, tiles down, tiles across), and the Gaussian of each pair.
+        Offsets (tiles of all images,) and Gaussians of pairs as `blend_forward` takes them.
     """
-    compiled = compiled_functions()
-    radii, means2d, depths = projected[:3]
-    across, down = (math.ceil(side / TILE) for side in size)
+    across, down = grid_of(size)
     with torch.cuda.device(radii.device):  # gsplat's functions launch on the current one
         # gsplat also takes the index of each Gaussian, but does not use it.
         _, pairs, flat = compiled.intersect_tile(
-            means2d, radii, depths, of_image, of_image, count, TILE, across, down, True, False
+            means2d, radii, depths, images, images, count, TILE, across, down, True, False
         )
-        return compiled.intersect_offset(pairs, count, across, down), flat
+        return compiled.intersect_offset(pairs, count, across, down).view(-1), flat
 
 
 @lru_cache(maxsize=1)
-def compiled_functions() -> Any:
-    """Return gsplat's module of compiled functions."""
+def compiled_functions() -> Any | None:
+    """Return gsplat's module of compiled functions; None if it would have to be compiled, or is of another release."""
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    version, built = installed_version("gsplat"), gsplat_built()
+    if built is None or version is None or not version.startswith(KNOWN_RELEASES):
+        return None
+    # gsplat loads what it compiled at an earlier use only where it finds nvcc.
+    if not built and not (CUDA_HOME and any(Path(extensions_folder()).glob("gsplat_cuda/gsplat_cuda*.so"))):
+        return None
     from gsplat.cuda._backend import _C
 
     return _C

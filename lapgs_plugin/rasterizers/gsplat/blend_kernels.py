@@ -24,8 +24,7 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.ops.launch import launch
-from lapgs_plugin.rasterizers.gsplat.bindings import TILE
-from lapgs_plugin.rasterizers.gsplat.records import GRADIENT, RECORD
+from lapgs_plugin.rasterizers.gsplat.records import GRADIENT, RECORD, TILE, grid_of
 
 WARP = 32
 COLUMNS = 4
@@ -42,7 +41,7 @@ LEAST = tl.constexpr(1e-4)
 INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
 
 # Kernels are not compiled anew for other sizes.
-NOT_SPECIALIZED = ("width", "height", "across", "tiles", "all_tiles", "pairs")
+NOT_SPECIALIZED = ("width", "height", "across", "tiles", "known", "pairs")
 
 
 class Shape(NamedTuple):
@@ -200,22 +199,22 @@ def _region(
 
 
 @triton.jit
-def _pairs_of(index: tl.tensor, offsets: tl.tensor, all_tiles: int, pairs: int) -> tuple[tl.tensor, tl.tensor]:
-    """Return the first pair of a tile, and the one after its last."""
-    return tl.load(offsets + index), tl.load(offsets + index + 1, index + 1 < all_tiles, pairs)
+def _pairs_of(index: tl.tensor, offsets: tl.tensor, known: int, pairs: int) -> tuple[tl.tensor, tl.tensor]:
+    """Return the first pair of a tile, and the one after its last; `known` offsets are in memory."""
+    return tl.load(offsets + index), tl.load(offsets + index + 1, index + 1 < known, pairs)
 
 
-@triton.jit(do_not_specialize=("across", "tiles", "all_tiles", "pairs"))  # no types
+@triton.jit(do_not_specialize=("across", "tiles", "known", "pairs"))
 def _reach_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
-    across: int, tiles: int, all_tiles: int, pairs: int,
+    across: int, tiles: int, known: int, pairs: int,
     columns: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, threads: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write which of the tile's pairs reach each of its regions, a bit for each pair."""
     index = tl.program_id(0)
     row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
     regions: tl.constexpr = (tile // columns) * (tile // rows)
-    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
+    begin, stop = _pairs_of(index, offsets, known, pairs)
     block = _first_word(index, begin, regions)
     thread = tl.arange(0, threads)
     while begin < stop:
@@ -330,7 +329,7 @@ def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tens
 def _forward_kernel(
     records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
-    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int, of_background: int,
+    width: int, height: int, across: int, tiles: int, known: int, pairs: int, of_background: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
@@ -344,7 +343,7 @@ def _forward_kernel(
     # Sums over the Gaussians of each thread.
     red, green, blue, cover = inside * 0.0, inside * 0.0, inside * 0.0, inside * 0.0
 
-    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
+    begin, stop = _pairs_of(index, offsets, known, pairs)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
     another, queue = tl.load(flat + begin, begin < stop, 0), queues + tl.program_id(0) * QUEUE
     gaussians, word = _pairs(begin, stop, flat, words, regions)
@@ -425,7 +424,7 @@ def _backward_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
     counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
     gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
-    width: int, height: int, across: int, tiles: int, all_tiles: int, pairs: int,
+    width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
     absolute: tl.constexpr,
 ) -> None:  # fmt: skip
@@ -447,7 +446,7 @@ def _backward_kernel(
     second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
     count = tl.load(counts + tl.program_id(0))
-    begin, stop = _pairs_of(index, offsets, all_tiles, pairs)
+    begin, stop = _pairs_of(index, offsets, known, pairs)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
     another, queue = tl.load(flat + begin, begin < stop, 0), queues + tl.program_id(0) * QUEUE
     gaussians, word = _pairs(begin, stop, flat, words, regions)
@@ -482,17 +481,20 @@ def _backward_kernel(
 
 
 def blend_forward(
-    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape = SHAPE
-) -> tuple[Tensor, Tensor, Tensor]:
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], count: int,
+    shape: Shape = SHAPE,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Blend the Gaussians of each tile; arguments are contiguous.
 
     Args:
         records: (c, n, RECORD) float32 of c cameras, or (n, RECORD) of several images' Gaussians in one list; numbers
             of Gaussians in no tile are never read.
         background: (3,) float32, or (c, 3) with one of each image.
-        offsets: (c, tiles down, tiles across) int32, the first pair of each tile.
-        flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile.
+        offsets: (c · tiles down · tiles across,) int32, the first pair of each tile; or one more, the number of pairs.
+        flat: (p,) int32, the Gaussian of each pair, counted over all cameras; front to back in a tile. With the number
+            of pairs it may be longer.
         size: (width, height) of the images.
+        count: of images.
         shape: of a program's work.
 
     Returns:
@@ -500,15 +502,15 @@ def blend_forward(
         words whose bits say which pairs reach a region.
     """
     width, height = size
-    programs, numbers = _launch_of(offsets, flat, size, shape)
-    words = flat.new_empty((len(flat) // WARP + offsets.numel()) * shape.regions)
+    programs, numbers = _launch_of(offsets, flat, size, count, shape)
+    words = flat.new_empty((len(flat) // WARP + len(offsets)) * shape.regions)
     launch(
-        _reach_kernel, (offsets.numel(),),
+        _reach_kernel, (programs // shape.regions,),
         records, offsets, flat, words, *numbers[2:],
         columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
         num_warps=REACH_WARPS,
     )  # fmt: skip
-    images = records.new_empty(len(offsets), height, width, 3)
+    images = records.new_empty(count, height, width, 3)
     counts = flat.new_empty(programs)
     launch(
         _forward_kernel, (programs,),
@@ -537,7 +539,7 @@ def blend_backward(
         Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and (c, n, 1) by c, or (c, n, 3) with
         the absolute sums of those by x and y.
     """
-    programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), shape)
+    programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), len(images), shape)
     assert len(counts) == programs
     count, each = records.numel() // RECORD, 3 if absolute else 1
     zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
@@ -553,8 +555,9 @@ def blend_backward(
     return found.view(*leading, GRADIENT), others.view(*leading, each)
 
 
-def _launch_of(offsets: Tensor, flat: Tensor, size: tuple[int, int], shape: Shape) -> tuple[int, tuple[int, ...]]:
+def _launch_of(
+    offsets: Tensor, flat: Tensor, size: tuple[int, int], count: int, shape: Shape
+) -> tuple[int, tuple[int, ...]]:
     """Return the number of programs and the arguments named in `NOT_SPECIALIZED`."""
-    all_tiles, across = offsets.numel(), offsets.shape[-1]
-    numbers = *size, across, offsets[0].numel(), all_tiles, len(flat)
-    return all_tiles * shape.regions, numbers
+    across, down = grid_of(size)
+    return count * across * down * shape.regions, (*size, across, across * down, len(offsets), len(flat))

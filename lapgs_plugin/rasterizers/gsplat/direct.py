@@ -1,9 +1,9 @@
-"""Render one view, or several of one size, by our kernels and gsplat's sorting.
+"""Render one view, or several of one size, by our kernels.
 
 `gsplat.rasterization` is a chain of five differentiable functions with PyTorch operations between them. For small
-images its launches take more time than its kernels. Here a render is one autograd node: our kernels project (`kernels`)
-and blend (`blend_kernels`), and gsplat's compiled functions sort Gaussians into tiles. Several views take as many
-launches as one.
+images its launches take more time than its kernels. Here a render is one autograd node: our kernels project
+(`kernels`), sort Gaussians into tiles (`tiles`) and blend (`blend_kernels`). Several views take as many launches as
+one. Of gsplat only its sorting is called, and only where it is compiled already.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
 from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
+from lapgs_plugin.rasterizers.gsplat.tiles import blend_in_tiles
 
 GradientTargets = list[weakref.ref[Tensor]]
 """Tensors to which a backward pass writes its gradients by centres and their absolute values, (n, 2) or (c, n, 2) each.
@@ -92,13 +92,11 @@ def forward(
         background: (3,).
         given, cameras, degree, signed, describes: as `kernels.project` takes them.
     """
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
     from lapgs_plugin.rasterizers.gsplat.kernels import project
 
-    size = cameras.width, cameras.height
     seen = project(given, cameras, degree, signed, describes)
-    tiles = bindings.sort_into_tiles(seen, size, len(cameras.poses))
-    return seen, tiles, blend_forward(seen.records, background, *tiles, size)
+    size = cameras.width, cameras.height
+    return seen, *blend_in_tiles(seen, background, size, len(cameras.poses))
 
 
 def _channels_first(images: Tensor) -> Tensor:

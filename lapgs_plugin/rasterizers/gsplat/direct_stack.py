@@ -1,4 +1,4 @@
-"""Render several fields from one camera by our kernels and gsplat's sorting, each at its own size.
+"""Render several fields from one camera by our kernels, each at its own size.
 
 Each field is projected for its own image. Then all are sorted and blended together, as if they were images of several
 cameras: their Gaussians are in one list, which gsplat calls packed, each with the number of its image.
@@ -15,9 +15,9 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
-from lapgs_plugin.rasterizers.gsplat import bindings
 from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras, cameras_on_device
 from lapgs_plugin.rasterizers.gsplat.records import RECORD, Parameters
+from lapgs_plugin.rasterizers.gsplat.tiles import blend_in_tiles
 
 
 class DirectStack(FieldStack):
@@ -56,17 +56,15 @@ class DirectStack(FieldStack):
 
     def _blended(self, cameras: Sequence[Camera], behind: Tensor, size: tuple[int, int]) -> Tensor:
         """Return images (f, h, w, 3) of the first fields, over backgrounds (f, 3)."""
-        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
         from lapgs_plugin.rasterizers.gsplat.kernels import project_into
 
         count, like = self._starts[len(cameras)], behind
         radii = torch.empty(count, 2, dtype=torch.int32, device=self._device)
-        means2d, depths, records = (like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
-        stacked = radii, means2d, depths, records
+        stacked = radii, *(like.new_empty(count, *columns) for columns in ((2,), (), (RECORD,)))
         poses, intrinsics, centres = cameras_on_device(cameras, like)
         for i, (camera, field) in enumerate(zip(cameras, self._fields, strict=False)):
             if len(field.means) > 0:
                 on_device = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
                 project_into(stacked, self._starts[i], field, on_device, i, self._signed[i])
-        tiles = bindings.sort_into_tiles(stacked, size, len(cameras), self._images[:count])
-        return blend_forward(records, behind, *tiles, size)[0]
+        _, (images, *_) = blend_in_tiles(stacked, behind, size, len(cameras), self._images[:count])
+        return images

@@ -4,8 +4,9 @@ gsplat takes colours as they are, so signed colour needs no change to it: its ow
 added or clamped. Ordinary colour is evaluated here as well, because gsplat would invert the camera's pose for it, which
 waits for the GPU.
 
-A call waits for the GPU once, inside gsplat, which needs the number of pairs of Gaussians and tiles. A packed call also
-needs the number of visible Gaussians.
+Our own kernels (`direct`) take the place of gsplat's where they can. They need PyTorch and Triton alone. A call of
+gsplat's waits for the GPU once, for the number of pairs of Gaussians and tiles; a packed one also for that of visible
+Gaussians.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lapgs_plugin.environment import gsplat_built
+from lapgs_plugin.environment import gsplat_built, triton_missing
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -57,10 +58,24 @@ SEMANTICS = Semantics(
 )
 
 
-def missing() -> str:
-    """Return why gsplat cannot render on this machine, as a clause; empty if it can. Imports and compiles nothing."""
+def missing(*, direct: bool = True) -> str:
+    """Return why this rasterizer cannot render on this machine, as a clause; empty if it can.
+
+    It imports and compiles nothing.
+
+    Args:
+        direct: whether our own kernels may render.
+    """
     if not torch.cuda.is_available():
         return "PyTorch finds no CUDA device"
+    ours, gsplats = triton_missing() if direct else "", gsplat_missing()
+    if direct and not ours:
+        return ""
+    return gsplats and " and ".join(filter(None, (ours, gsplats)))
+
+
+def gsplat_missing() -> str:
+    """Return why gsplat's own CUDA part cannot be used, as a clause; empty if it can. Imports and compiles nothing."""
     built = gsplat_built()
     if built is None:
         return "gsplat is not installed"
@@ -72,7 +87,7 @@ def missing() -> str:
 class GsplatRasterizer(Rasterizer):
     """Render float32 fields on a CUDA device with gsplat and the conventions of the 3DGS family.
 
-    If its CUDA part is not built yet, gsplat compiles it in the first call, which takes minutes.
+    Where our kernels do not render and gsplat's CUDA part is not built yet, gsplat compiles it, which takes minutes.
 
     Args:
         device: that renders; tests render on a CPU with a stand-in for gsplat.
@@ -85,7 +100,8 @@ class GsplatRasterizer(Rasterizer):
             validated on this machine. Not available with `packed` or `antialiasing`.
 
     Raises:
-        MissingExtraError: gsplat cannot render on this machine.
+        MissingExtraError: neither our kernels nor gsplat's can render on this machine. A call raises it, too, if ours
+            fail their validation.
     """
 
     name = NAME
@@ -103,11 +119,13 @@ class GsplatRasterizer(Rasterizer):
         direct: bool | None = None,
     ) -> None:
         self._device = torch.device(device)
-        if self._device.type == "cuda" and (reason := missing()):
-            raise MissingExtraError(f"--rasterizer {NAME}: {reason}; `lapgs doctor` says what to install")
+        may_be_direct = not (packed or antialiasing) and direct is not False
+        if self._device.type == "cuda" and (reason := missing(direct=may_be_direct)):
+            why = "--packed and --antialiased need gsplat's CUDA part: " if packed or antialiasing else ""
+            raise MissingExtraError(f"--rasterizer {NAME}: {why}{reason}; `lapgs doctor` says what to install")
         self._stock = StockRasterization(antialiasing, packed, own_radii)
         self._absgrad = absgrad
-        self._may_be_direct = self._device.type == "cuda" and not (packed or antialiasing) and direct is not False
+        self._may_be_direct = self._device.type == "cuda" and may_be_direct
         self._must_be_direct = bool(direct)
         self._cameras = CameraCache()
 
@@ -168,10 +186,14 @@ class GsplatRasterizer(Rasterizer):
 
     @property
     def can_stack(self) -> bool:
-        """See `fields.rasterizer.Rasterizer`. The stack calls functions of gsplat 1.5."""
+        """See `fields.rasterizer.Rasterizer`. The stack calls our kernels, or functions of gsplat 1.5."""
+        if self._device.type != "cuda" or self._stock.packed:
+            return False
+        if self._may_be_direct and gsplat_missing():
+            return True
         from gsplat import spherical_harmonics
 
-        return self._device.type == "cuda" and not self._stock.packed and not takes_viewmats(spherical_harmonics)
+        return not takes_viewmats(spherical_harmonics)
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""
@@ -183,7 +205,13 @@ class GsplatRasterizer(Rasterizer):
         """Return whether kernels are called directly, for fields or cameras that are rendered together."""
         coefficients = 3 * max(len(field) for field in fields) * max(field.sh.shape[1] for field in fields)
         numbers = max(coefficients, RECORD * cameras * sum(map(len, fields)))
-        return self._may_be_direct and numbers <= MOST_NUMBERS and (self._must_be_direct or direct_works())
+        few = numbers <= MOST_NUMBERS
+        if self._may_be_direct and few and (self._must_be_direct or direct_works()):
+            return True
+        if self._device.type == "cuda" and (reason := gsplat_missing()):
+            why = "do not work here (the log says why)" if few else f"cannot count {numbers} numbers of these Gaussians"
+            raise MissingExtraError(f"--rasterizer {NAME}: our kernels {why}, and {reason}; `lapgs doctor` says more")
+        return False
 
     def _render(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 
+TILE = 16
+"""Pixels of a tile's side."""
 RECORD, COLOR_IN_RECORD = 12, 8
 """Numbers of a Gaussian's record, which lies together in memory, and where its colour begins.
 
@@ -18,6 +20,11 @@ GRADIENT = 8
 """Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
 ALIGNMENT = 16
 """Bytes that our kernels read at once."""
+
+
+def grid_of(size: tuple[int, int]) -> tuple[int, int]:
+    """Return how many tiles an image of (width, height) has across and down."""
+    return -(-size[0] // TILE), -(-size[1] // TILE)
 
 
 class Parameters(NamedTuple):

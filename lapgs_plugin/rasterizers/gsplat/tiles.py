@@ -1,0 +1,105 @@
+"""Sort Gaussians into tiles and blend them, without a GPU that waits for the processor to learn the number of pairs.
+
+How much memory the pairs of Gaussians and tiles take is only known on the GPU. So there is room for as many as the
+renders before had, and some more. Sorting and blending are launched with that room, and pairs that have no place in it
+are left out. Then the processor reads the number of pairs, which the GPU knew before it began to sort: while it sorts
+and blends, it has work, and the processor goes on in time. If there was too little room, both are launched again with
+enough. This happens before anybody gets the image, and is seldom.
+
+Where gsplat's CUDA part is built already, its sorting is used, which takes the processor less time to launch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.errors import DeviceMemoryError
+from lapgs_plugin.rasterizers.gsplat.bindings import compiled_functions, sort_by_gsplat
+from lapgs_plugin.rasterizers.gsplat.records import grid_of
+
+MARGIN, FORGOTTEN = 1.125, 0.02
+"""Room by the number of pairs of the last renders, and the share of it that is given up with each render."""
+LEAST_ROOM, MOST_PAIRS = 2**14, 2**31 - 2**9
+"""Pairs that there is always room for, and those whose places our kernels can number."""
+
+_rooms: dict[tuple[Any, ...], float] = {}  # by device, size and number of images; estimates
+
+
+def blend_in_tiles(
+    projected: Sequence[Tensor], background: Tensor, size: tuple[int, int], count: int = 1,
+    of_image: Tensor | None = None,
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
+    """Sort Gaussians into tiles, front to back, and blend them.
+
+    Args:
+        projected: radii (c, n, 2), centres (c, n, 2), depths (c, n) and records (c, n, RECORD); or, without the
+            leading dimension, those of several images in one list.
+        background: as `blend_forward` takes it.
+        size: (width, height) of all images.
+        count: number of images.
+        of_image: in a list, the image number (n,) of each Gaussian.
+
+    Returns:
+        Offsets and Gaussians of pairs as `blend_forward` takes them, and its results.
+
+    Raises:
+        DeviceMemoryError: there are 2**31 pairs or more.
+    """
+    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
+
+    radii, means2d, depths, records = projected[:4]
+    if records.is_cuda and (compiled := compiled_functions()) is not None:
+        tiles = sort_by_gsplat(compiled, radii, means2d, depths, of_image, count, size)
+        return tiles, blend_forward(records, background, *tiles, size, count)
+    from lapgs_plugin.rasterizers.gsplat.tile_kernels import sort_by_depth, sort_by_tile
+
+    grid = grid_of(size)
+    order, ends = sort_by_depth(radii, means2d, depths, grid)
+    pairs = _LateNumber(ends[-1])
+    key = records.device, *size, count
+    room = _rounded(_rooms[key] if key in _rooms else MARGIN * pairs.read())
+    while True:
+        tiles = sort_by_tile(radii, means2d, order, ends, of_image, count, grid, room)
+        blended = blend_forward(records, background, *tiles, size, count)
+        wanted = MARGIN * pairs.read()
+        _rooms[key] = max(wanted, (1 - FORGOTTEN) * _rooms.get(key, 0.0))
+        if pairs.read() <= room:
+            return tiles, blended
+        room = _rounded(wanted)
+
+
+def _rounded(pairs: float) -> int:
+    """Round up to a number that comes often, so that PyTorch has memory of that size."""
+    if pairs > MARGIN * MOST_PAIRS:
+        raise DeviceMemoryError(
+            f"the GPU would have to sort {pairs / MARGIN:.3g} pairs of Gaussians and tiles of 16x16 pixels, and "
+            f"{MOST_PAIRS} at most can be; fewer or smaller Gaussians, fewer views at once or smaller images make fewer"
+        )
+    step = max(LEAST_ROOM, 1 << max(int(pairs).bit_length() - 5, 0))
+    return min(max(-(-int(pairs) // step), 1) * step, MOST_PAIRS)
+
+
+class _LateNumber:
+    """Copy a number from a device to page-locked memory, to be read when the device has arrived there."""
+
+    def __init__(self, number: Tensor) -> None:
+        self._value: int | None = None
+        self._copied: torch.cuda.Event | None = None
+        if number.is_cuda:
+            self._copy = torch.empty_like(number, device="cpu", pin_memory=True).copy_(number, non_blocking=True)
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
+            self._copied.record(torch.cuda.current_stream(number.device))
+        else:
+            self._copy = number
+
+    def read(self) -> int:
+        """Return the number; the first time, wait for it."""
+        if self._value is None:
+            if self._copied is not None:
+                self._copied.synchronize()
+            self._value = int(self._copy)
+        return self._value
