@@ -225,7 +225,9 @@ def _looks(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool)
     return colors, given.logits.sigmoid().expand(len(away), -1)
 
 
-def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
+def project(
+    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False
+) -> Projected:
     """As `kernels.project`, in PyTorch's operations."""
     radii, means2d, depths, conics, _ = _project(
         given.means, None, given.quaternions, given.log_scales.exp(), given.logits.sigmoid(),
@@ -236,7 +238,7 @@ def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool
     assert depths is not None
     assert conics is not None
     records, shown = records_of(means2d, conics, *_looks(given, cameras, degree, signed)), (radii > 0).all(-1)
-    if not describes:
+    if not with_geometry:
         return Projected(radii, means2d, depths, records, radii.new_empty(0), means2d.new_empty(0))
     largest, centres = torch.where(shown, radii.amax(-1), 0), torch.where(shown[..., None], means2d - 0.5, 0.0)
     return Projected(radii, means2d, depths, records, largest, centres)

@@ -111,7 +111,7 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     field = field.to("cuda")
     on_device, background = CameraCache().get(cameras, field.means), torch.zeros(3, device="cuda")
     seen, tiles, _ = direct.forward(
-        Parameters.of(field), on_device, background, field.sh_degree, field.signed, describes=False
+        Parameters.of(field), on_device, background, field.sh_degree, field.signed, with_geometry=False
     )
     return Sorted(seen.records, background, *tiles)
 

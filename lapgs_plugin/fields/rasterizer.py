@@ -138,7 +138,7 @@ class Rasterizer(ABC):
         *,
         background: Tensor,
         sh_degree: int | None = None,
-        describes: bool = True,
+        with_geometry: bool = True,
     ) -> RenderResult:
         """Render b cameras of one size differentiably, with as many launches as one camera takes.
 
@@ -147,7 +147,7 @@ class Rasterizer(ABC):
         Args:
             field, background, sh_degree: as `__call__` takes them.
             cameras: two or more.
-            describes: fill in radii and centres; False leaves them empty and is faster.
+            with_geometry: fill in radii and centres; False leaves them empty and is faster.
         """
         raise NotImplementedError
 

@@ -73,11 +73,11 @@ class InUnit(Rasterizer):
         *,
         background: Tensor,
         sh_degree: int | None = None,
-        describes: bool = True,
+        with_geometry: bool = True,
     ) -> RenderResult:
         scaled = [self._camera(camera) for camera in cameras]
         return self._inner.render_batch(
-            self._field(field), scaled, background=background, sh_degree=sh_degree, describes=describes
+            self._field(field), scaled, background=background, sh_degree=sh_degree, with_geometry=with_geometry
         )
 
     @property

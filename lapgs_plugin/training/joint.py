@@ -72,7 +72,7 @@ class JointFields:
             if len(cameras) == 1:
                 field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
                 return self.rasterizer.render_image(field, cameras[0], background=background)
-            result = self.rasterizer.render_batch(model.field, cameras, background=background, describes=False)
+            result = self.rasterizer.render_batch(model.field, cameras, background=background, with_geometry=False)
             return result.image
 
         return compose(self.pyramid, ((level, render(level, model)) for level, model in self.models.items())).image

@@ -368,7 +368,7 @@ class StageRun:
         needed, degree = self.densifier.needs_statistics(iteration), self.schedule.active_sh_degree(iteration)
         if len(cameras) > 1:
             result = self._rasterizer.render_batch(
-                gaussians, cameras, background=self.background, sh_degree=degree, describes=needed
+                gaussians, cameras, background=self.background, sh_degree=degree, with_geometry=needed
             )
             return result.image, result if needed else None
         if needed:

@@ -40,8 +40,10 @@ def warm_up(run: PreparedRun) -> None:
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
     if rasterizer.can_batch:
-        for describes in (True, False):  # rasterizers may take other kernels for images alone
-            images = rasterizer.render_batch(model.field, [camera] * 2, background=black, describes=describes).image
+        for with_geometry in (True, False):  # rasterizers may take other kernels for images alone
+            images = rasterizer.render_batch(
+                model.field, [camera] * 2, background=black, with_geometry=with_geometry
+            ).image
             none = torch.zeros(images.shape, dtype=target_types[0], device=device)
             photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
             model.step(0.0, 1, scale=StepScale.of(2))

@@ -155,7 +155,7 @@ def test_several_views_are_those_of_single_calls(views: int, degree: int, active
     print(views, degree, active, signed, {name: f"{value:.1e}" for name, value in worst.items()})
     assert worst["radii"] == 0
     assert max(worst.values()) < 2e-4, worst  # as for one view: sums in another order, in both
-    plain = rasterizer.render_batch(together, cameras, background=background, sh_degree=active, describes=False)
+    plain = rasterizer.render_batch(together, cameras, background=background, sh_degree=active, with_geometry=False)
     torch.testing.assert_close(plain.image, batch.image, rtol=0, atol=1e-5)
     plain.image.sum().backward()
 

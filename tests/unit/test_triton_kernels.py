@@ -54,7 +54,7 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     directions = [torch.nn.functional.normalize(leaves.means - each, dim=-1) for each in centres.double()]
     colors = torch.stack([sh_to_color(leaves.sh, each, active, signed=signed) for each in directions])
 
-    found = project(given, seen_from, active, signed, describes=True)
+    found = project(given, seen_from, active, signed, with_geometry=True)
     shown = (found.radii > 0).all(-1)
     assert 0.3 < shown.float().mean() < 0.7
     # Footprints end where alpha is 1/255, unless they end at 3.33 standard deviations before.

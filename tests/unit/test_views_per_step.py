@@ -84,7 +84,7 @@ class Batching(CpuRasterizer):
         *,
         background: Tensor,
         sh_degree: int | None = None,
-        describes: bool = True,
+        with_geometry: bool = True,
     ) -> RenderResult:
         assert len(cameras) > 1
         assert len({camera.size for camera in cameras}) == 1
@@ -95,7 +95,7 @@ class Batching(CpuRasterizer):
             raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
         each = [self(field, camera, background=background, sh_degree=sh_degree) for camera in cameras]
         images = torch.stack([result.image for result in each])
-        if not describes:
+        if not with_geometry:
             return RenderResult(images, None, each[0].radii[:0], each[0].means2d.detach()[:0])
         joined: Any = torch.stack([result.means2d.detach() for result in each])
         result = RenderResult(images, None, torch.stack([result.radii for result in each]), joined, None)
@@ -155,7 +155,7 @@ def test_a_batch_by_gsplat_is_its_views(direct: bool, signed: bool, own_radii: b
             assert expected is not None
             assert value.grad is not None
             assert float((value.grad - expected).abs().max() / expected.abs().max()) < tolerance, name
-    plain = rasterizer.render_batch(together, CAMERAS, background=BACKGROUND, sh_degree=1, describes=False)
+    plain = rasterizer.render_batch(together, CAMERAS, background=BACKGROUND, sh_degree=1, with_geometry=False)
     assert torch.equal(plain.image, batch.image)
     plain.image.sum().backward()
     nothing = field.with_parameters({name: value[:0] for name, value in field.parameters.items()})

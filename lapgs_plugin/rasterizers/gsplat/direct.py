@@ -44,7 +44,7 @@ def render(
     """
     differentiated = is_differentiated(field)
     absgrad = absgrad and differentiated
-    image, seen, targets = _render(field, cameras, background, degree, describes=True, absgrad=absgrad)
+    image, seen, targets = _render(field, cameras, background, degree, with_geometry=True, absgrad=absgrad)
     radii, means2d, conics = seen.visible_radii, seen.centres, seen.records[..., 2:5]
     if len(cameras.poses) == 1:
         radii, means2d, conics = radii[0], means2d[0], conics[0]
@@ -59,42 +59,42 @@ def render(
 
 def render_images(field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int) -> Tensor:
     """Render images alone, (3, h, w) or (c, 3, h, w) of several; arguments as `render` takes them."""
-    return _render(field, cameras, background, degree, describes=False, absgrad=False)[0]
+    return _render(field, cameras, background, degree, with_geometry=False, absgrad=False)[0]
 
 
 def _render(
-    field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int, *, describes: bool, absgrad: bool
+    field: GaussianField, cameras: DeviceCameras, background: Tensor, degree: int, *, with_geometry: bool, absgrad: bool
 ) -> tuple[Tensor, Projected, GradientTargets]:
     """Render, and return a list to which the tensors that take gradients can be added.
 
     Args:
         field, cameras, background, degree, absgrad: as `render` takes them.
-        describes: fill in visible radii and centres, which are empty otherwise.
+        with_geometry: fill in visible radii and centres, which are empty otherwise.
     """
     background = background.to(field.means).contiguous()
     given = Parameters.of(field)
     targets: GradientTargets = []
     if is_differentiated(field):
         box: list[Projected] = []
-        options = cameras, background, degree, field.signed, describes, absgrad, box, targets
+        options = cameras, background, degree, field.signed, with_geometry, absgrad, box, targets
         image: Tensor = _Render.apply(*given, *options)  # type: ignore[no-untyped-call]  # torch's
         return image, box[0], targets
-    seen, _, (images, *_) = forward(given, cameras, background, degree, field.signed, describes)
+    seen, _, (images, *_) = forward(given, cameras, background, degree, field.signed, with_geometry)
     return _channels_first(images), seen, targets
 
 
 def forward(
-    given: Parameters, cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool
+    given: Parameters, cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, with_geometry: bool
 ) -> tuple[Projected, tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
     """Return Gaussians as the cameras see them; their tiles, sorted; and what `blend_forward` makes of them.
 
     Args:
         background: (3,).
-        given, cameras, degree, signed, describes: as `kernels.project` takes them.
+        given, cameras, degree, signed, with_geometry: as `kernels.project` takes them.
     """
     from lapgs_plugin.rasterizers.gsplat.kernels import project
 
-    seen = project(given, cameras, degree, signed, describes)
+    seen = project(given, cameras, degree, signed, with_geometry)
     size = cameras.width, cameras.height
     return seen, *blend_in_tiles(seen, background, size, len(cameras.poses))
 
@@ -110,11 +110,11 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor,
-        cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, describes: bool, absgrad: bool,
+        cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, with_geometry: bool, absgrad: bool,
         box: list[Projected], targets: GradientTargets,
     ) -> Tensor:  # fmt: skip
         given = Parameters(means, quaternions, log_scales, logits, sh)
-        seen, tiles, blended = forward(given, cameras, background, degree, signed, describes)
+        seen, tiles, blended = forward(given, cameras, background, degree, signed, with_geometry)
         ctx.save_for_backward(*given, *cameras[:3], seen.radii, seen.records, *tiles, *blended)
         ctx.size, ctx.degree, ctx.signed = (cameras.width, cameras.height), degree, signed
         ctx.absgrad, ctx.targets = absgrad, targets

@@ -336,7 +336,7 @@ def _project_kernel(
     radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, records: tl.tensor,
     visible_radii: tl.tensor, visible_pixels: tl.tensor,
     width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
-    coefficients: tl.constexpr, describes: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
+    coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -381,7 +381,7 @@ def _project_kernel(
         _store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
         _store_four(into + 4, wide * inverse, opacity, opacity, opacity, visible)
         _store_four(into + 8, red, green, blue, blue, visible)
-        if describes:
+        if with_geometry:
             tl.store(visible_radii + placed, tl.maximum(across, down), here)
             tl.store(visible_pixels + 2 * placed, tl.where(visible, pixel_x - 0.5, 0.0), here)
             tl.store(visible_pixels + 2 * placed + 1, tl.where(visible, pixel_y - 0.5, 0.0), here)
@@ -406,7 +406,7 @@ def _of_covariance(
 
 
 @triton.jit
-def _of_place(
+def _grad_of_mean(
     pose: tl.tensor, u: tl.tensor, v: tl.tensor, limited_u: tl.tensor, limited_v: tl.tensor, inverse: tl.tensor,
     x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor,
     fx: tl.tensor, fy: tl.tensor, fz: tl.tensor, gx: tl.tensor, gy: tl.tensor, gz: tl.tensor,
@@ -502,7 +502,7 @@ def _shape_gradient_kernel(
         by_zz += fz * pz + gz * qz
         fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
-        right, down, ahead = _of_place(
+        right, down, ahead = _grad_of_mean(
             poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, fx, fy, fz, gx, gy, gz
         )
         by_x += right
@@ -633,22 +633,24 @@ def _color_gradient_kernel(
         _store_three(by_mean + 3 * rows, before_x + by_x, before_y + by_y, before_z + by_z, here)
 
 
-def project(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, describes: bool = False) -> Projected:
+def project(
+    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False
+) -> Projected:
     """Project at least one Gaussian, and evaluate its colour.
 
     Args:
         degree: highest of SH to evaluate.
         signed: whether colours are the raw SH values.
-        describes: fill in visible radii and centres.
+        with_geometry: fill in visible radii and centres.
     """
     count, n, like = len(cameras.poses), len(given.means), given.means
     integers = like.new_empty(count, n, 2, dtype=torch.int32)
-    described = n if describes else 0
+    described = n if with_geometry else 0
     made = Projected(
         integers, like.new_empty(count, n, 2), like.new_empty(count, n), like.new_empty(count, n, RECORD),
         integers.new_empty(count, described), like.new_empty(count, described, 2),
     )  # fmt: skip
-    _project(given, cameras, (0, count), degree, signed, made, 0, describes)
+    _project(given, cameras, (0, count), degree, signed, made, 0, with_geometry)
     return made
 
 
@@ -664,18 +666,18 @@ def project_into(
         given, cameras, signed: as `project` takes them; all coefficients are evaluated.
     """
     made = Projected(*stacked, *stacked[:2])
-    _project(given, cameras, (camera, 1), math.isqrt(given.sh.shape[1]) - 1, signed, made, start, describes=False)
+    _project(given, cameras, (camera, 1), math.isqrt(given.sh.shape[1]) - 1, signed, made, start, with_geometry=False)
 
 
 def _project(
     given: Parameters, cameras: DeviceCameras, chosen: tuple[int, int], degree: int, signed: bool, into: Projected,
-    start: int, describes: bool,
+    start: int, with_geometry: bool,
 ) -> None:  # fmt: skip
     n = len(given.means)
     launch(
         _project_kernel, (blocks(n, BLOCK),),
         *given, *cameras[:3], *into, cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start,
-        coefficients=given.sh.shape[1], describes=describes, record=RECORD, block=BLOCK,
+        coefficients=given.sh.shape[1], with_geometry=with_geometry, record=RECORD, block=BLOCK,
     )  # fmt: skip
 
 

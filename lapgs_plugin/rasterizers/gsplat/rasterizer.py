@@ -161,10 +161,10 @@ class GsplatRasterizer(Rasterizer):
         *,
         background: Tensor,
         sh_degree: int | None = None,
-        describes: bool = True,
+        with_geometry: bool = True,
     ) -> RenderResult:
         """Render several cameras in one set of launches; see `fields.rasterizer.Rasterizer`."""
-        if describes:
+        if with_geometry:
             return self._render(field, cameras, background, sh_degree)
         image = self._images(field, cameras, background, sh_degree)
         count, like = len(cameras), field.means

@@ -40,18 +40,18 @@ def direct_works(device: torch.device) -> float:
         weights = torch.randn(len(cameras), 3, camera.height, camera.width, generator=generator)
         exact = [value.double().requires_grad_() for value in values]
         expected = _oracles(_field(exact, signed), cameras, background, degree, weights, exact)
-        for describes in (True, False):
+        for with_geometry in (True, False):
             leaves = [value.to(device, copy=True).requires_grad_() for value in values]
             on_device = CameraCache().get(cameras, leaves[0])
             given = _field(leaves, signed), on_device, background.to(device), degree
-            if describes:
+            if with_geometry:
                 result = direct.render(*given, absgrad=True, own_radii=True)
                 image = result.image
             else:
                 image = direct.render_images(*given)
             (image * weights.to(device)).sum().backward()  # type: ignore[no-untyped-call]  # torch's
             found = [image.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
-            if describes:
+            if with_geometry:
                 assert result.absgrad2d is not None
                 assert result.means2d.grad is not None
                 found += [result.means2d.grad, result.absgrad2d]
