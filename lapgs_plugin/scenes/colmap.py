@@ -93,11 +93,13 @@ def with_bare_names(model: Model, folder: Path) -> Model:
 
     Programs write the folder of the machine that they ran on, or that of the photos. Codebases of 3DGS ignore it.
     """
-    images = dict(model.images)
+    images, names = dict(model.images), {image.name for image in model.images.values()}
     for key, image in model.images.items():
         written = PurePosixPath(image.name)
         inside = not written.is_absolute() and ".." not in written.parts
-        if not (inside and is_file(find_image(folder / written))) and is_file(find_image(folder / written.name)):
+        if written.name in names or (inside and is_file(find_image(folder / written))):
+            continue
+        if is_file(find_image(folder / written.name)):
             images[key] = replace(image, name=written.name)
     return replace(model, images=images)
 
