@@ -179,7 +179,7 @@ def read_text(path: Path, *, error: type[UserInputError] = UserInputError, advic
     """Read a text file of at most `TEXT_BYTES`; arguments and errors as in `read_json`."""
     data = _read(path, TEXT_BYTES, "expected a file written by hand", error, advice)
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")  # editors on Windows write the mark
     except UnicodeDecodeError as cause:
         raise error(
             f"{path} is not readable: byte {cause.start} is {shortened(data[cause.start : cause.start + 1])}, expected "

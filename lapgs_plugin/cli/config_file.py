@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin import __version__
-from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError, nearest
+from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError, nearest, printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.runs.layout import RUN_CONFIG
 from lapgs_plugin.untrusted import read_text, read_toml
@@ -54,7 +55,8 @@ def naming_the_config(meta: Mapping[str, Any]) -> Iterator[None]:
         option = re.match("(?:invalid value for ')?--([a-z-]+)", str(error))
         name = option[1].replace("-", "_") if option else "scene"
         source = context.get_parameter_source(name)
-        about = option is not None or str(error).startswith(str(context.params.get(name)))
+        scene = printable(str(context.params.get(name)))  # as it is in messages
+        about = option is not None or str(error).startswith((scene, "scene "))
         if source is None or source.name != "DEFAULT_MAP" or not about:
             raise
         raise type(error)(f"{path}: {error}") from error
@@ -79,7 +81,7 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
         UserInputError: the file is not TOML, has a key that is no option, or a value that is not a string, number or
             boolean.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise UserInputError(f"--config {path}: no such file; a run folder has one, {RUN_CONFIG}")
     known = {str(each.name).replace("_", "-"): each for each in context.command.params if each.name not in OF_ONE_CALL}
     values: dict[str, Any] = {}

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_plugin.errors import printable_lines
+from lapgs_plugin.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,16 +33,16 @@ def make_console(*, stderr: bool = False) -> Console:
 
 
 def say(text: str, *, stderr: bool = False) -> None:
-    """Print lines at once, with control characters of names as escapes."""
-    print(printable_lines(text), file=sys.stderr if stderr else sys.stdout, flush=True)
+    """Print one line at once, with control characters and line breaks of names as escapes."""
+    print(printable(text), file=sys.stderr if stderr else sys.stdout, flush=True)
 
 
 class _EscapingFormatter(logging.Formatter):
-    """Show control characters of names as escapes in messages of this program."""
+    """Show messages of this program as one line each, with control characters of names as escapes."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)
-        return printable_lines(text) if record.name.startswith("lapgs_") else text
+        return printable(text) if record.name.startswith("lapgs_") else text
 
 
 def log_to_stderr(pattern: str = "lapgs: %(message)s") -> None:

@@ -16,6 +16,7 @@ from lapgs_plugin.cli.config_file import ConfigOption, extended_config, write_co
 from lapgs_plugin.cli.output import log_to_stderr, make_console, say
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
+from lapgs_plugin.errors import printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option
@@ -127,7 +128,7 @@ def _finish(out: Path, scene: Path) -> None:
     from lapgs_plugin.viewer.preview import save_run_preview
 
     save_run_preview(out, moved_to=scene)
-    name, word = escape(str(out)), escape(shlex.quote(str(out)))
+    name, word = (escape(printable(text)) for text in (str(out), shlex.quote(str(out))))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",
         soft_wrap=True,

@@ -37,6 +37,7 @@ from lapgs_plugin.files import (
     MANIFEST,
     PREVIEW,
     TEMPORARY_PATTERN,
+    is_file,
     is_folder,
     one_line_errors,
     require_own_entries,
@@ -105,7 +106,8 @@ def require_place(folder: Path, option: str = "--out") -> None:
             raise UserInputError(f"{option} {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
         existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
     if not is_folder(Path(existing)):
-        raise UserInputError(f"{option} {folder}: {existing} is a file; expected a folder, or a name for a new one")
+        what = "a file" if is_file(Path(existing)) else "no folder"  # such as a link that leads nowhere
+        raise UserInputError(f"{option} {folder}: {existing} is {what}; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise UserInputError(f"{option} {folder}: {existing} is not writable; choose another folder")
     new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]

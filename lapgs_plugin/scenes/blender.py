@@ -415,5 +415,8 @@ def _read_points(transforms: Path, values: Values, frames: Sequence[Frame], warn
         cloud = read_point_cloud(file, f"{transforms} names {file}" if file in places[:2] else f"{file}")
     if named and file not in places[:2] and (file or not cloud):  # nerfstudio, too, takes random points then
         warnings.append(f"{transforms} names {named}: no such file; training starts from {file or 'random points'}")
+    if cloud and not len(cloud.xyz):
+        warnings.append(f"{file}: no points in it; training starts from random points")
+        return None
     warnings += [cloud.warning] if cloud and cloud.warning else []
     return cloud

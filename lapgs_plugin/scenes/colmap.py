@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from shlex import quote
 
 import numpy as np
@@ -70,7 +70,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
             hint = undistort_hint(path, camera.model.name)
             raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({distortion}); {hint}")
     folder = path / images
-    source = source_of(sparse, folder)
+    source = source_of(with_bare_names(sparse, folder), folder)
     if not is_folder(folder):
         first = next((frame.name for frame in source.train), "")
         raise SceneError(f"{folder}: no such folder of images; {where_else(path, first)}")
@@ -86,6 +86,22 @@ def larger_model(path: Path, model: Path) -> tuple[str, ...]:
         f"{model} places {count_images(model)} photos and {larger} {count_images(larger)}; make a scene of the latter "
         f"with `lapgs prepare {quote(str(path))} OUT --model {quote(str(larger))}`",
     )
+
+
+def with_bare_names(model: Model, folder: Path) -> Model:
+    """Return a model whose images are named without folders where only that names a file in `folder`.
+
+    Programs write the folder of the machine that they ran on, or that of the photos. Codebases of 3DGS ignore it.
+    """
+    images, names = dict(model.images), {image.name for image in model.images.values()}
+    for key, image in model.images.items():
+        written = PurePosixPath(image.name)
+        inside = not written.is_absolute() and ".." not in written.parts
+        if written.name in names or (inside and is_file(find_image(folder / written))):
+            continue
+        if is_file(find_image(folder / written.name)):
+            images[key] = replace(image, name=written.name)
+    return replace(model, images=images)
 
 
 def source_of(model: Model, folder: Path) -> SceneSource:

@@ -79,7 +79,8 @@ def read_model(folder: Path, observations: bool = False) -> Model:
                 f"of cameras.{suffix}; copy or export the model again"
             )
     model = Model(folder, cameras, images, _read_points(points[0], observations))
-    return replace(model, warnings=tuple(_contradictions(model, suffix, points)))
+    warnings = [model.points.warning] if model.points.warning else []
+    return replace(model, warnings=(*warnings, *_contradictions(model, suffix, points)))
 
 
 def count_images(folder: Path) -> int:
@@ -113,7 +114,7 @@ def _formats(folder: Path) -> tuple[str, list[Path]]:
 def _read_points(file: Path, observations: bool = False) -> Points:
     if file.suffix == ".ply":
         cloud = read_point_cloud(file, f"{file}")
-        return Points(cloud.xyz, 255.0 * cloud.rgb)
+        return Points(cloud.xyz, 255.0 * cloud.rgb, warning=cloud.warning)
     if file.suffix == ".bin":
         return colmap_binary.read_points(file, observations)
     return colmap_text.read_points(file, observations)
@@ -153,12 +154,13 @@ def _difference(model: Model, file: Path, suffix: str) -> str:
 
 
 def _differing(own: _Entries, others: _Entries) -> str:
-    names = [name for name in own.keys() | others.keys() if not _same(own.get(name), others.get(name))]
-    return f"{len(names)} of {max(len(own), len(others))} entries differ" if names else ""
+    total = max(len(own), len(others))
+    same = sum(_same(entry, others.get(name)) for name, entry in own.items())
+    return f"{total - same} of {total} entries differ" if same < total else ""
 
 
-def _same(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> bool:
-    if one is None or other is None or one.shape != other.shape:
+def _same(one: NDArray[np.float64], other: NDArray[np.float64] | None) -> bool:
+    if other is None or one.shape != other.shape:
         return False
     with np.errstate(invalid="ignore"):  # inf - inf
         return bool(np.abs(one - other).max() <= SAME * np.abs(one).max())

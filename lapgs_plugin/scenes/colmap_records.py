@@ -53,12 +53,14 @@ class Points:
         errors: (n,) mean reprojection errors in pixels, NaN where there is none; empty unless asked for.
         tracks: for each point (k, 2) image ids and numbers of their features, which may not exist; empty unless asked
             for.
+        warning: a line for whoever trains on the points, or "".
     """
 
     xyz: NDArray[np.float64]  # (n, 3)
     rgb: NDArray[np.float64]  # (n, 3)
     errors: Sequence[float] = ()
     tracks: Sequence[NDArray[np.int64]] = ()
+    warning: str = ""
 
 
 NO_FEATURES: NDArray[np.float64] = np.empty((0, 2))

@@ -38,6 +38,7 @@ NUMBERS = frozenset("0123456789+-.einfaEINFA \t")
 CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"
 IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
 POINT = "POINT3D_ID X Y Z R G B with finite numbers"
+COLORS = "whole colours R G B from 0 to 255"
 
 
 class _Line:
@@ -175,9 +176,9 @@ def read_points(file: Path, observations: bool = False) -> Points:
         if len(line.words) < 7:
             line.refuse(POINT)
         xyz.append(line.finite(line.words[1:4], POINT))
-        rgb.append(line.whole(line.words[4:7], POINT))
+        rgb.append(line.whole(line.words[4:7], COLORS))
         if not 0 <= min(rgb[-1]) <= max(rgb[-1]) <= 255:
-            line.refuse("colours from 0 to 255")
+            line.refuse(COLORS)
         if observations:
             errors.append(_number(line.words[7:8]))
             tracks.append(_track(line.words[8:]))

@@ -11,9 +11,10 @@ import logging
 import os
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,13 +39,17 @@ Image.MAX_IMAGE_PIXELS = None  # sizes are checked here; Pillow's own limit is b
 FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 CUT_SHORT = re.compile("premature end|marker 0xd9 instead", re.IGNORECASE)
 """Complaints of libjpeg about an image that ends early."""
+NAMED_DAMAGE = 5
+"""Most photos of a folder of which the decoder's complaints are shown: a camera writes all of its photos alike."""
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
-
 logger = logging.getLogger(__name__)
+
+_named: defaultdict[Path, list[Path]] = defaultdict(list)
+"""The photos whose complaints were shown, by folder."""
 
 
 def find_image(path: Path) -> Path:
@@ -463,12 +468,17 @@ def _refuse_cut_jpeg(path: Path, complaint: str) -> None:
     if not reaches_its_end(path):
         raise damaged(path, "it has no end")
     if "extraneous bytes" not in complaint:
-        _log_once(f"{path}: parts of the photo may be wrong ({complaint}); copy it again if they are")
+        _log_once(path, complaint)
 
 
-@cache  # a photo may be read several times
-def _log_once(line: str) -> None:
-    logger.warning(line)
+def _log_once(path: Path, complaint: str) -> None:
+    """Log a complaint about a photo, which may be read several times, unless enough of its folder's are named."""
+    named = _named[path.parent]
+    if path in named or len(named) >= NAMED_DAMAGE:
+        return
+    named.append(path)
+    more = "; more photos of this folder are not named" if len(named) == NAMED_DAMAGE else ""
+    logger.warning("%s: parts of the photo may be wrong (%s); copy it again if they are%s", path, complaint, more)
 
 
 class _Channels(NamedTuple):

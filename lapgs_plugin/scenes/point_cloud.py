@@ -23,6 +23,8 @@ RANGES = (1.0, 255.0, 65535.0)
 """Full brightness of colours; whole numbers have the last two."""
 MOST = (0.01, 0.99)
 """Quantiles of colours that tell their range; few are far outside of it, such as highlights."""
+DARK = 0.1
+"""Share of the range below which most colours are dark: they may have fewer bits, such as 12, or none."""
 UNDERSHOOT, OVERSHOOT = 0.05, 1.0
 """How far these may be outside, as a share of the range: resampled colours are."""
 
@@ -71,11 +73,14 @@ def read_point_cloud(file: Path, subject: str) -> PointCloud:
     values = np.stack([element.data[names[channel]] for channel in channels], axis=1)
     if channels == COLOR_NAMES[-1]:
         return PointCloud(xyz, 0.5 + SH_C0 * values.astype(np.float64), "")
-    return PointCloud(xyz, values.astype(np.float64) / _range(values, subject), "")
+    brightest, most = _range(values, subject)
+    dark = most < DARK * brightest and len(xyz) > 0
+    warning = f"{subject}: its colours are at most {most:g} of {brightest:g}, so that its points start dark; scale them"
+    return PointCloud(xyz, values.astype(np.float64) / brightest, warning if dark else "")
 
 
-def _range(values: NDArray[np.generic], subject: str) -> float:
-    """Return the value of full brightness of colours (n, 3), by their values."""
+def _range(values: NDArray[np.generic], subject: str) -> tuple[float, float]:
+    """Return the value of full brightness of colours (n, 3), by their values, and what most are not above."""
     finite = values[np.isfinite(values)].astype(np.float64)
     least, most = np.quantile(finite, MOST) if finite.size else (0.0, 0.0)
     ranges = RANGES if values.dtype.kind == "f" else RANGES[1:]
@@ -85,4 +90,4 @@ def _range(values: NDArray[np.generic], subject: str) -> float:
             f"{subject}: most of its colours are from {least:g} to {most:g}, expected 0 to 1, 0 to 255 or 0 to 65535; "
             "export them again"
         )
-    return brightest
+    return brightest, float(most)

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from lapgs_plugin.errors import printable
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.progress import LoggingProgress
 
@@ -106,4 +107,4 @@ class ProgressMonitor(Monitor):
 
     def say(self, text: str) -> None:
         if self._advice:
-            self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
+            self._progress.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)

@@ -73,6 +73,9 @@ def test_mistakes(run: Path, tmp_path: Path) -> None:
         lapgs_export(run, "--format", "splat")
     with pytest.raises(RunFolderError, match="level 7 is not in this run"):
         lapgs_export(run, "--level", 7)
+    (tmp_path / "link").symlink_to("gone")
+    with pytest.raises(UserInputError, match=r"--out .*link is no folder; expected a folder"):
+        lapgs_export(run, "-o", tmp_path / "link")
     (tmp_path / "file").touch()
     for merge in ((), ("--merge",)):  # before the fit, which takes minutes
         with pytest.raises(UserInputError, match=r"--out .*file is a file; expected a folder"):

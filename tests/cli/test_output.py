@@ -99,8 +99,8 @@ def test_messages_name_folders_as_they_were_typed(
         succeeding(app, 120)(*words.split())
 
 
-ODD = "r\x1b]0;title\x07\udcff[b]"
-"""A name with a control sequence, a byte that is no UTF-8, and markup of rich."""
+ODD = "r\x1b]0;title\n\x07\udcff[b]"
+"""A name with a control sequence, a line break, a byte that is no UTF-8, and markup of rich."""
 
 
 @pytest.mark.parametrize(
@@ -122,6 +122,6 @@ def test_names_reach_the_terminal_as_escapes_on_success_too(command: str, tmp_pa
     words = [name, str(run), *options] if name != "train" else [name, *options, str(run)]
     result = CliRunner(charset="utf-8").invoke(app, words)
     assert result.exit_code == 0, result.output
-    assert r"r\x1b]0;title\x07\udcff[b]" in result.output.replace("\n", "")
-    assert RunArchive.open(run).name == r"r\x1b]0;title\x07\udcff[b]"  # on pages, too
+    assert r"r\x1b]0;title\n\x07\udcff[b]" in result.output.replace("\n", "")
+    assert RunArchive.open(run).name == r"r\x1b]0;title\n\x07\udcff[b]"  # on pages, too
     assert not re.search("[\x00-\x09\x0b-\x1f\udcff]", result.output)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import warnings
 from pathlib import Path
 
@@ -144,6 +146,14 @@ def test_a_mistake_in_the_file_is_one_line(scene: Path, tmp_path: Path, text: st
     assert not (tmp_path / "run").exists()
 
 
+def test_the_file_of_a_scene_is_named_whatever_the_scene(tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    for scene in (r'"a\u001b[31m\nb"', r'"a\u0000b"', "3"):
+        config.write_bytes(b"\xef\xbb\xbf" + f"scene = {scene}\n".encode())  # with the mark of Windows' editors
+        with pytest.raises(UserInputError, match=f"^{config}: "):
+            lapgs("train", "--config", config, "-o", tmp_path / "run")
+
+
 def test_only_values_of_the_file_are_said_to_be_of_it(scene: Path, tmp_path: Path) -> None:
     config = tmp_path / "mine.toml"
     config.write_text('scene = "gone"\njoint = 2.0\n')
@@ -159,6 +169,11 @@ def test_only_values_of_the_file_are_said_to_be_of_it(scene: Path, tmp_path: Pat
 def test_a_file_that_is_not_there(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="no such file"):
         lapgs("train", scene, "--config", tmp_path / "none.toml", "-o", tmp_path / "run")
+    (tmp_path / "loop.toml").symlink_to("loop.toml")
+    os.mkfifo(tmp_path / "pipe.toml")
+    for name, what in (("loop.toml", "links"), ("pipe.toml", "a pipe, socket or device"), ("", "directory")):
+        with pytest.raises(UserInputError, match=rf"{re.escape(name)} cannot be read: .*(?i:{what}).*; correct it"):
+            lapgs("train", scene, "--config", tmp_path / name, "-o", tmp_path / "run")
 
 
 def test_tensorboard_has_the_figures_of_the_history(scene: Path, tmp_path: Path) -> None:

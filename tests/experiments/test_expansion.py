@@ -165,6 +165,16 @@ def test_commands_of_the_built_in_trainer(tmp_path: Path) -> None:
     assert words_after(bare.command, "--levels") == ["1"]
 
 
+@pytest.mark.parametrize("checkout", [None, "fastgs"])
+def test_experiments_choose_hooks(tmp_path: Path, checkout: str | None) -> None:
+    (scene := tmp_path / "scene" / "images").mkdir(parents=True)
+    Image.new("RGB", (64, 48)).save(scene / "0.jpg")
+    assert all("hooks" in names for names in _option_names().values()), "experiment files may set it"
+    spec = run_spec(checkout=checkout, rasterizer=None if checkout else "cpu", options={"hooks": "none"})
+    step = run_steps(spec, scene.parent, tmp_path, tmp_path / "r", None)[0]
+    assert words_after(step.command, "--hooks") == ["none"]
+
+
 @pytest.mark.parametrize("command", ["train", "run"])
 def test_flags_on_and_off_are_words_that_the_command_knows(command: str) -> None:
     parameters = typer.main.get_command(app).commands[command].params

@@ -139,6 +139,18 @@ def test_names_with_backslashes(tmp_path: Path, binary: bool) -> None:
     assert [view.name for view in load(path).train] == list(names)
 
 
+@pytest.mark.parametrize("folder", ["images", "/home/me/photos", "../images", "C:\\photos"])
+def test_names_with_a_folder_that_is_not_there(tmp_path: Path, folder: str) -> None:
+    """As 3DGS reads them: by what follows the last slash."""
+    path = make_scene(tmp_path, Model(NAMES[:2]), binary=False)
+    file = path / "sparse" / "0" / "images.txt"
+    file.write_text(re.sub(r"(?m)(my photo|b\.png)", lambda name: f"{folder}/{name[0]}", file.read_text()))
+    assert {view.name for view in load(path).train} == set(NAMES[:2])
+    (path / "images" / "b.png").unlink()
+    with pytest.raises(SceneError, match=r"b\.png"):
+        load(path)
+
+
 # Files that contradict each other
 
 
@@ -212,6 +224,16 @@ def test_poses_are_those_of_the_images_not_of_the_frames(tmp_path: Path, kind: s
         assert re.search(rf"frames\.{kind}: {what}.*; images\.{kind} is used, COLMAP uses the frames", line)
 
 
+def test_images_that_were_numbered_anew_are_none_of_the_frames(tmp_path: Path) -> None:
+    rig_of_two(tmp_path)
+    file = tmp_path / "images.txt"
+    for other in tmp_path.glob("*.bin"):
+        other.unlink()
+    file.write_text(re.sub(r"(?m)^([12][12] \S+ \S+ \S+ )", r"9\1", file.read_text()))
+    (line,) = read_model(tmp_path).warnings
+    assert "frames.txt: 4 of 4 entries differ" in line
+
+
 def test_text_beside_binary_files(tmp_path: Path) -> None:
     folder = tmp_path
     Model(NAMES).write(folder, binary=False)
@@ -222,7 +244,7 @@ def test_text_beside_binary_files(tmp_path: Path) -> None:
     assert read_model(folder).warnings == ()
     for name, old, new, what in (
         ("cameras", "80", "90", "1 of 1 entries"),
-        ("images", "b.png", "c.png", "2 of 4 entries"),
+        ("images", "b.png", "c.png", "1 of 4 entries"),
         ("images", "4.0 ", "4.5 ", "1 of 4 entries"),
         ("images", r" 1 b\.png", "", "damaged"),
         ("points3D", r"^1 .*\n", "", "39 points in place of 40"),
@@ -339,6 +361,16 @@ def test_colours_that_are_none(tmp_path: Path) -> None:
         write_ply(file, POINTS, np.linspace(least, most, POINTS.size).reshape(POINTS.shape).astype(kind))
         with pytest.raises(SceneError, match=r"a\.ply: most of its colours are from .*, expected 0 to 1, 0 to 255"):
             read_point_cloud(file, str(file))
+
+
+@pytest.mark.parametrize(("kind", "most", "full"), [("u2", 4095, 65535), ("f4", 1023, 65535), ("u1", 1, 255)])
+def test_colours_of_another_range_are_a_line(tmp_path: Path, kind: str, most: int, full: int) -> None:
+    """Twelve bits in sixteen, and shares of 1 that were cast to bytes."""
+    path = make_scene(tmp_path)
+    write_ply(path / "sparse" / "0" / "points3D.ply", POINTS, (COLORS / 255 * most).astype(kind))
+    (path / "sparse" / "0" / "points3D.bin").unlink()
+    (line,) = read_colmap(path, path / "sparse" / "0", "images", evaluate=False).warnings
+    assert re.search(rf"points3D\.ply: its colours are at most \d+\S* of {full}, so that its points start dark", line)
 
 
 @pytest.mark.parametrize("scale", RANGES)

@@ -386,6 +386,13 @@ def test_files_that_are_no_photos_are_named(noise: Path, caplog: pytest.LogCaptu
         (noise / name).write_bytes(b"\0\0\0 ftypqt  ")
     assert list(find_photos(noise).files) == ["0.jpg", "1.jpg", "2.jpg"]
     assert "not photos, left out: a.dng, b.mov" in caplog.text
+    (noise / "gone.jpg").symlink_to("elsewhere/gone.jpg")
+    (noise / "loop.png").symlink_to("loop.png")
+    os.mkfifo(noise / "pipe.heic")
+    assert list(find_photos(noise).files) == ["0.jpg", "1.jpg", "2.jpg"]
+    assert "links that lead nowhere, pipes or devices, left out: gone.jpg, loop.png, pipe.heic" in caplog.text
+    with pytest.raises(SceneError, match=r"pipe\.heic: a pipe, socket or device; give a folder of photos, or a video"):
+        find_photos(noise / "pipe.heic")
 
 
 def test_photos_of_several_cameras_get_cameras_of_their_own(

@@ -668,8 +668,8 @@ def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
             r"points3D\.txt: line 1 is '1 x .*', expected POINT3D_ID X Y Z R G B",
         ),
         ("points3D", r"^1 .*", "1 0.5", r"line 1 is '1 0\.5', expected POINT3D_ID"),
-        ("points3D", r"^(1 \S+ \S+ \S+) \S+", r"\1 999", "expected colours from 0 to 255"),
-        ("points3D", r"^(1 \S+ \S+ \S+) \S+", r"\1 12.5", "expected POINT3D_ID X Y Z R G B"),
+        ("points3D", r"^(1 \S+ \S+ \S+) \S+", r"\1 999", "expected whole colours R G B from 0 to 255"),
+        ("points3D", r"^(1 \S+ \S+ \S+) \S+", r"\1 12.5", "expected whole colours R G B from 0 to 255"),
         ("points3D", r"^1 \S+", "1 1e300", r"a sparse point lies at 1e\+300, expected at most 1e\+12"),
     ],
 )

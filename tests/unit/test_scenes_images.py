@@ -393,6 +393,11 @@ def test_a_jpeg_that_ends_early_or_holds_wrong_bits(tmp_path: Path, caplog: pyte
     for _ in range(2):
         assert read_image(path).shape == (3, 60, 80)
     assert caplog.text.count("a.jpg: parts of the photo may be wrong (JPEG error: ") == 1
+    for number in range(8):  # of a camera that writes all of them so
+        (tmp_path / f"{number}.jpg").write_bytes(path.read_bytes())
+        read_image(tmp_path / f"{number}.jpg")
+    assert caplog.text.count("may be wrong") == 5
+    assert caplog.text.endswith("; more photos of this folder are not named\n")
 
 
 def png_chunks(content: bytes) -> list[bytes]:

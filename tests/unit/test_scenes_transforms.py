@@ -396,6 +396,14 @@ def test_points_with_float_colors_or_none(tmp_path: Path, caplog: pytest.LogCapt
     assert "points3d.ply: no colours among x, y, z; its points start grey" in caplog.text
 
 
+def test_a_ply_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = capture(tmp_path)
+    write_ply(path / "pc.ply", np.empty((0, 3)), np.empty((0, 3), np.float32))
+    edit(path, {"ply_file_path": "pc.ply"})
+    assert len(load(path).points) == 100_000
+    assert "pc.ply: no points in it; training starts from random points" in caplog.text
+
+
 def test_random_points_of_a_blender_scene_fill_3dgs_cube(tmp_path: Path) -> None:
     """3DGS puts 100,000 points into the cube of +-1.3 around the origin, made for cameras at NeRF's distance."""
     scene = load(nerf_scene(tmp_path))

@@ -95,11 +95,11 @@ def test_a_scene_trains_and_renders_alike_in_any_units(hierarchy: str, strategy:
         found[scale] = quality, float(base.means.norm(dim=1).median()) / scale, float(middle)
     assert found[1.0][0] > 12.0, "trained, and not black"
     for values in found.values():
-        assert values[0] == pytest.approx(found[1.0][0], abs=0.1)  # 0.02 seen
-        assert values[1:] == pytest.approx(found[1.0][1:], rel=0.02)  # 0.004 seen
+        assert values[0] == pytest.approx(found[1.0][0], abs=0.1)  # 0.0004 seen
+        assert values[1:] == pytest.approx(found[1.0][1:], rel=0.02)  # 2e-5 seen
 
 
-def test_a_resumed_run_and_its_poses_are_in_the_users_units(tmp_path: Path) -> None:
+def test_corrections_of_poses_are_in_the_users_units(tmp_path: Path) -> None:
     """Corrections of poses are shifts in world units: those of a scene 64 times as large are 64 times as long."""
     shifts = []
     for scale in (1.0, 64.0):
@@ -109,7 +109,8 @@ def test_a_resumed_run_and_its_poses_are_in_the_users_units(tmp_path: Path) -> N
         assert poses is not None
         shifts.append(torch.tensor([poses[name][3:] for name in sorted(poses)]))
     assert shifts[0].norm() > 0.0
-    torch.testing.assert_close(shifts[1] / 64.0, shifts[0], rtol=0.05, atol=0.05 * float(shifts[0].abs().max()))
+    largest = float(shifts[0].abs().max())
+    torch.testing.assert_close(shifts[1] / 64.0, shifts[0], rtol=0.0, atol=0.05 * largest)  # 0.002 * largest seen
 
 
 @pytest.mark.parametrize("scale", [*SCALES, 0.7, 1.9])
@@ -137,12 +138,12 @@ def test_a_rasterizer_in_a_unit_renders_scaled_fields_as_the_others(signed: bool
         images.append(result.image.detach())
         assert torch.equal(rasterizer.render_image(one, seen, background=BLACK), result.image)
         assert torch.equal(rasterizer.render_images(one, [seen, seen], background=BLACK)[1], result.image)
-    torch.testing.assert_close(images[1], images[0], rtol=1e-4, atol=1e-4)  # 2e-6 seen
+    torch.testing.assert_close(images[1], images[0], rtol=1e-4, atol=1e-4)  # 2.4e-7 seen
     gradients = [one.means.grad for one in fields]
     assert gradients[0] is not None
     assert gradients[1] is not None
     error = (gradients[1] * unit - gradients[0]).norm() / gradients[0].norm()
-    assert float(error) < 1e-3  # 4e-6 seen
+    assert float(error) < 1e-3  # 4e-7 seen
     assert not plain(small, cameras[1], background=BLACK).image.any(), "all nearer than its near plane"
     assert in_unit(plain, 1.0) is plain
 
@@ -179,8 +180,8 @@ def test_batches_and_stacks_are_scaled_too() -> None:
 def test_what_cameras_look_at_does_not_depend_on_units(scale: float) -> None:
     cameras = [ring_camera(0.3 * i) for i in range(4)]
     plain, other = Rig.of(cameras), Rig.of([scaled(camera, scale) for camera in cameras])
-    np.testing.assert_allclose(other.focus / scale, plain.focus, atol=1e-4)
-    assert other.distance / scale == pytest.approx(plain.distance, rel=1e-4)
+    np.testing.assert_allclose(other.focus / scale, plain.focus, atol=1e-4)  # 2e-7 seen
+    assert other.distance / scale == pytest.approx(plain.distance, rel=1e-4)  # 6e-8 seen
 
 
 def test_a_page_draws_from_the_near_plane_of_the_run(tmp_path: Path) -> None:
@@ -198,8 +199,8 @@ def test_copies_of_a_point_are_no_neighbours(jitter: float) -> None:
     copies = points.repeat(4, 1) + jitter * torch.randn(800, 3, generator=generator)
     repeated = field_from_points(copies, torch.rand(800, 3), 0)
     wrong = (repeated.log_scales - plain.log_scales.repeat(4, 1)).abs()
-    assert float((wrong > 1e-3).float().mean()) < (0.1 if jitter else 1e-9)  # 0.03 seen, at the borders of places
-    assert float(wrong.max()) < math.log(2.5)
+    assert float((wrong > 1e-3).float().mean()) < (0.1 if jitter else 1e-9)  # 0 to 0.03 seen: borders of places
+    assert float(wrong.max()) < math.log(2.5)  # 0.62 seen
 
 
 @pytest.mark.parametrize(

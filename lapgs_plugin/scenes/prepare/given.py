@@ -17,10 +17,18 @@ from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.options import option_name
 from lapgs_plugin.scenes.blender import FISHEYE, SINGLE_FILE, Lenses, has_transforms, read_transforms
-from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, is_straight, larger_model, largest_model, source_of
+from lapgs_plugin.scenes.colmap import (
+    MODEL_PLACES,
+    find_model,
+    is_straight,
+    larger_model,
+    largest_model,
+    source_of,
+    with_bare_names,
+)
 from lapgs_plugin.scenes.colmap_model import Model, count_images, read_model
 from lapgs_plugin.scenes.colmap_records import NO_FEATURES, NO_TRACK, Points, PosedImage
-from lapgs_plugin.scenes.images import find_image, image_size
+from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
@@ -119,9 +127,10 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     if not transforms:
         model = read_model(place, observations=True)
         _check_lenses(model)
-        source = source_of(model, photos)
-        folder = max((photos / name for name in FOLDERS), key=lambda folder: _fit(source, folder))
-        frames = [replace(frame, path=find_image(folder / frame.name)) for frame in source.train]
+        choices = [(with_bare_names(model, photos / name), photos / name) for name in FOLDERS]
+        model, folder = max(choices, key=lambda choice: _fit(source_of(*choice)))
+        source = source_of(model, folder)
+        frames = list(source.train)
     else:
         lenses: Lenses = {}
         source, folder = read_transforms(photos, "images", False, lenses), photos
@@ -164,13 +173,13 @@ def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
     return Given(_reconstruction(model, files), there, Photos(folder, files), tuple(left_out), settings)
 
 
-def _fit(source: SceneSource, folder: Path) -> tuple[int, bool]:
-    """Return how many photos of a model are in a folder, and whether the first of them has its camera's size.
+def _fit(source: SceneSource) -> tuple[int, bool]:
+    """Return how many photos of a model are in their folder, and whether the first of them has its camera's size.
 
     3DGS's convert.py leaves photos in `input` and undistorted ones, which may have the same shape, in `images`.
     """
-    there = [(file, frame) for frame in source.train if is_file(file := find_image(folder / frame.name))]
-    return len(there), any(image_size(file) == frame.camera.size for file, frame in there[:1])
+    there = [frame for frame in source.train if is_file(frame.path)]
+    return len(there), any(image_size(frame.path) == frame.camera.size for frame in there[:1])
 
 
 def _check_lenses(model: Model) -> None:

@@ -60,15 +60,17 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     if source.is_file():
         return Photos(source.parent, {}, source)
     if not source.is_dir():
-        raise SceneError(f"{source}: no such folder of photos or video")
+        what = "a pipe, socket or device" if source.exists() else "no such folder of photos or video"
+        raise SceneError(f"{source}: {what}; give a folder of photos, or a video")
     aside = None if masks is None or masks.resolve() == source.resolve() else masks.resolve()
-    present = sorted(
-        file
-        for file in source.rglob("*")
-        if file.is_file()
-        and not any(part.startswith(".") for part in file.relative_to(source).parts)
-        and not (aside is not None and file.resolve().is_relative_to(aside))
+    entries = sorted(
+        entry
+        for entry in source.rglob("*")
+        if not entry.is_dir() and not any(part.startswith(".") for part in entry.relative_to(source).parts)
     )
+    present = [file for file in entries if file.is_file() and not (aside and file.resolve().is_relative_to(aside))]
+    if unreadable := [entry.name for entry in entries if has_photo_suffix(entry) and not entry.is_file()]:
+        logger.warning("links that lead nowhere, pipes or devices, left out: %s", listed(unreadable))
     chosen = [file for file in present if has_photo_suffix(file)]
     if heic := [file.name for file in chosen if _kind(file) in HEIC]:
         what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed(heic)})"
