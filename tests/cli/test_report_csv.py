@@ -173,3 +173,11 @@ def test_an_unfinished_run_is_refused(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene, finished=1)
     assert "only 1 of 2 levels" in refused(run, "--csv", tmp_path / "data.csv")
     assert not (tmp_path / "data.csv").exists()
+
+
+def test_a_damaged_backbone_is_refused(runs: Path, tmp_path: Path) -> None:
+    manifest = runs / "nested/manifest.json"
+    change(manifest, settings={**json.loads(manifest.read_text())["settings"], "backbone": 5})
+    message = refused(runs / "nested", "--csv", tmp_path / "data.csv")
+    assert str(manifest) in message
+    assert "backbone" in message
