@@ -2,6 +2,9 @@
 
 Run `python docs/tables.py` after changing a data file; a test compares the documents with it. A table stands between
 `<!-- table: NAME -->` and `<!-- end -->`. Each row of a data file is one run; a table shows means over seeds.
+
+`lapgs report RUN --csv docs/data/train.csv` appends the row of a measured run to train.csv. Replace
+the method "own script" of an imported run by the script's name there, such as FastGS.
 """
 
 from __future__ import annotations

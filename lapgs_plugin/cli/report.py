@@ -9,7 +9,7 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console, make_table, say, show_log
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError, UserInputError, counted
 from lapgs_plugin.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
@@ -32,6 +32,14 @@ def report(
     baseline: Annotated[
         Path | None, typer.Option(help="Another run to compare with, such as one trained with --levels 1.")
     ] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Instead of writing the page, append a row for each run to this CSV file. It is made if it is not "
+            "there. Runs have to be measured before, with `lapgs eval`.",
+        ),
+    ] = None,
     options: RenderOptions,
 ) -> None:
     """Print the metrics of RUN and write RUN/report.html with curves and images.
@@ -41,6 +49,7 @@ def report(
     and the scenes whose runs still exist.
     """
     from lapgs_plugin.evaluation.figures import run_metrics
+    from lapgs_plugin.reports.data_file import append_rows, data_row
     from lapgs_plugin.reports.folders import FOLDER_REPORTS
     from lapgs_plugin.reports.report import MeasuredRun, write_report
     from lapgs_plugin.runs.archive import RunArchive
@@ -48,19 +57,26 @@ def report(
     run = run or _newest(Path("runs"))
     for name in FOLDER_REPORTS:
         if (run / FOLDER_REPORTS[name].marker).is_file():
-            if baseline or options.scene:
+            if baseline or options.scene or csv:
                 raise UserInputError(
-                    f"{run} ({name}) has baselines and scenes of its own; leave out --baseline and --scene"
+                    f"{run} ({name}) has baselines and scenes of its own; leave out --baseline, --scene and --csv"
                 )
             show_log()
             say(f"{FOLDER_REPORTS[name]().write(run, options)} shows the {name}")
             return
     archives = [RunArchive.open(path) for path in (run, baseline) if path is not None]
     show_log()
-    runs = [MeasuredRun(archive, run_metrics(archive, options)) for archive in archives]
-    page = write_report(runs[0], runs[1] if len(runs) > 1 else None, options)
+    runs = [MeasuredRun(archive, run_metrics(archive, None if csv else options)) for archive in archives]
+    if csv is None:
+        page = write_report(runs[0], runs[1] if len(runs) > 1 else None, options)
+        last_line = f"{page} shows this with curves and images"
+    else:
+        append_rows(csv, [data_row(run, options.scene) for run in runs])
+        last_line = f"{csv} has {counted(len(runs), 'more row')}"
+        if names := ", ".join(run.name for run in runs if run.metrics["split"] != "test"):
+            last_line += f"; psnr, psnr_fit, ssim and lpips of {names} are empty: no held-out views were measured"
     _print(runs)
-    say(f"{page} shows this with curves and images")
+    say(last_line)
 
 
 def _newest(folder: Path) -> Path:

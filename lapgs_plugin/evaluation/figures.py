@@ -22,6 +22,7 @@ Its keys, with levels as text as JSON requires:
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from torch import Tensor
@@ -170,15 +171,22 @@ def _measure_view(
     return figures, levels
 
 
-def run_metrics(archive: RunArchive, options: RenderOptions) -> dict[str, Any]:
+def run_metrics(archive: RunArchive, options: RenderOptions | None) -> dict[str, Any]:
     """Return the run's metrics.json, or measure it with `evaluate_run` when it does not exist.
 
+    Args:
+        archive: the run.
+        options: of the measurement; None refuses a run without metrics.json.
+
     Raises:
-        RunFolderError: see `evaluate_run`; or another program wrote the file.
+        RunFolderError: see `evaluate_run`; another program wrote the file; or it does not exist and `options` is None.
     """
     require_complete(archive)
     metrics = archive.metrics()
     if metrics is None:
+        if options is None:
+            advice = f"measure the run with `lapgs eval {shlex.quote(str(archive.path()))}`"
+            raise RunFolderError(f"{archive.path(METRICS)} does not exist; {advice}")
         return evaluate_run(archive, options)
     if missing := METRIC_KEYS - metrics.keys():
         raise RunFolderError(

@@ -111,7 +111,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         strips=view_strips(run, renderers, options.scene),
         views=view_table(runs),
         settings=_settings(run),
-        advised=_takes_advice(run.archive.manifest),
+        advised=knows_options(run.archive.manifest),
     )
     path = run.archive.path(REPORT)
     write_text(path, page)
@@ -294,10 +294,14 @@ def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
     return ViewTable([*keys.values(), *(["baseline PSNR", "gain"] if others else [])], rows)
 
 
-def _takes_advice(manifest: Manifest) -> bool:
-    """Return whether options of `lapgs train` and `lapgs run` can be advised: not to a loop of the user's own."""
-    settings = manifest.settings
-    return "iterations" in settings and "imported_from" not in settings.get("backbone", {})
+def knows_options(manifest: Manifest) -> bool:
+    """Return whether a run has options of `lapgs train` or `lapgs run`: no loop of the user's own, no imported run."""
+    return "iterations" in manifest.settings and not is_imported(manifest)
+
+
+def is_imported(manifest: Manifest) -> bool:
+    """Return whether `lapgs import-run` made a run folder."""
+    return "imported_from" in manifest.settings.get("backbone", {})
 
 
 def _settings(run: MeasuredRun) -> dict[str, str]:

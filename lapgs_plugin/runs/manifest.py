@@ -55,6 +55,7 @@ class KnownSettings(StrictWithMore):
     hierarchy: NotRequired[Literal["nested", "laplacian"]]
     clamped: NotRequired[bool]
     raster: NotRequired[dict[str, bool | int | float | None]]
+    backbone: NotRequired[dict[str, Any]]
 
 
 @dataclass(frozen=True)

@@ -172,6 +172,8 @@ def test_the_newest_run_or_experiment_is_reported_on(
 def test_mistakes(experiment: Path) -> None:
     with pytest.raises(UserInputError, match="has baselines and scenes of its own; leave out --baseline"):
         lapgs_report(experiment, "--baseline", experiment / "runs" / "0-cpu-1-0")
+    with pytest.raises(UserInputError, match=r"leave out .*--csv"):
+        lapgs_report(experiment, "--csv", experiment / "data.csv")
     (experiment / "results.csv").write_text("name,value\na,1\n")
     with pytest.raises(
         RunFolderError, match=r"results.csv lacks backbone, baseline, gaussians, run, .*expected what `lapgs bench`"
