@@ -15,6 +15,10 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+
+STACK_PIXELS = 3_000_000
+"""Pixels of the finest rendered level up to which one set of launches for all fields is faster than streams."""
 
 
 @dataclass
@@ -57,16 +61,31 @@ class FieldRenderer:
     except for a field that has to be copied there first.
 
     Attributes:
-        fields, rasterizer, background, clamped, concurrent, stack_pixels, offload: as in `HierarchyRenderer`.
+        fields: by level; contiguous from `levels - 1` down to the finest that is finished. On the device that renders
+            them, or anywhere when there is an `offload`.
+        levels: number of levels of the whole hierarchy, L.
+        pyramid: Up between two levels; on the grid the hierarchy was trained with.
+        rasterizer: renders every field.
+        background: RGB behind the base. Residuals are always rendered over zero.
+        clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
+            paper authors' release does in training and rendering.
+        concurrent: on a GPU, let fields be rendered at the same time if the rasterizer can. The extensions of 3DGS
+            codebases cannot: all their kernels go to one stream.
+        stack_pixels: with `concurrent`, the most pixels of the finest rendered level for which all fields of a view are
+            rendered in one set of launches; 0 for never. It needs an `offload` that keeps fields on the device, because
+            it renders a copy of them.
+        offload: copies fields to the device when they are needed; None when they are there, and may still change.
     """
 
     fields: Mapping[int, GaussianField]
+    levels: int
+    pyramid: Pyramid
     rasterizer: Rasterizer
-    background: tuple[float, float, float]
-    clamped: bool
-    concurrent: bool
-    stack_pixels: int
-    offload: FieldOffload | None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clamped: bool = False
+    concurrent: bool = True
+    stack_pixels: int = STACK_PIXELS
+    offload: FieldOffload | None = None
 
     @cached_property
     def device(self) -> torch.device:
@@ -78,7 +97,7 @@ class FieldRenderer:
         wanted = self.fields[level]
         return wanted if self.offload is None else self.offload.bring(level, wanted)
 
-    def render(
+    def render_fields(
         self, cameras: Sequence[Camera], levels: Sequence[int], omitted: Collection[int] = ()
     ) -> Iterator[tuple[int, Tensor]]:
         """Yield each level and its field's renders (b, 3, h, w), for use in the current stream.
@@ -95,7 +114,7 @@ class FieldRenderer:
         return self._render_stacked(cameras[0], levels) if stacked else self._render_each(cameras, levels, omitted)
 
     def render_level(self, cameras: Sequence[Camera], level: int) -> Tensor:
-        """Render one field in the current stream; arguments and errors as `render`."""
+        """Render one field in the current stream; arguments and errors as `render_fields`."""
         at_level = [level_camera(camera, level) for camera in cameras]
         with self._full_memory_explained([level], at_level[0]):
             background = self.background_of(level)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -25,15 +24,12 @@ from lapgs_plugin.runs.manifest import Manifest
 CLAMPED = "clamped"
 """Key of a manifest's settings: whether its levels were composed with `HierarchyRenderer.clamped`."""
 
-STACK_PIXELS = 3_000_000
-"""Pixels of the finest rendered level up to which one set of launches for all fields is faster than streams."""
-
 LARGEST_GAIN = 1000.0
 """Largest gain of a band; more is a typing error."""
 
 
 @dataclass(frozen=True)
-class HierarchyRenderer:
+class HierarchyRenderer(FieldRenderer):
     """Render the finished levels of a hierarchy and compose them.
 
     A signed field is added to the upsampled image of the coarser ones. With nested levels no field is signed: each
@@ -41,36 +37,10 @@ class HierarchyRenderer:
 
     Upsampling and adding a level is one kernel, in the stream that is current when `render` is called.
 
-    Attributes:
-        fields: by level; contiguous from `levels - 1` down to the finest that is finished. On the device that renders
-            them, or anywhere when there is an `offload`.
-        levels: number of levels of the whole hierarchy, L.
-        pyramid: Up between two levels; on the grid the hierarchy was trained with.
-        rasterizer: renders every field.
-        background: RGB behind the base. Residuals are always rendered over zero.
-        clamped: clamp each field's own render before it is added, the base to [0, 1] and residuals to [-1, 1], as the
-            paper authors' release does in training and rendering.
-        concurrent: on a GPU, let fields be rendered at the same time if the rasterizer can. The extensions of 3DGS
-            codebases cannot: all their kernels go to one stream.
-        stack_pixels: with `concurrent`, the most pixels of the finest rendered level for which all fields of a view are
-            rendered in one set of launches; 0 for never. It needs an `offload` that keeps fields on the device, because
-            it renders a copy of them.
-        offload: copies fields to the device when they are needed; None when they are there, and may still change.
-
     Raises:
         UserInputError: a level between the coarsest and the finest given is missing, the base is signed, or some of
             the finer fields are and others not.
     """
-
-    fields: Mapping[int, GaussianField]
-    levels: int
-    pyramid: Pyramid
-    rasterizer: Rasterizer
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    clamped: bool = False
-    concurrent: bool = True
-    stack_pixels: int = STACK_PIXELS
-    offload: FieldOffload | None = None
 
     def __post_init__(self) -> None:
         given = sorted(self.fields, reverse=True)
@@ -143,21 +113,6 @@ class HierarchyRenderer:
             clamped=bool(manifest.settings.get(CLAMPED, False)),
             offload=offload,
         )
-
-    @cached_property
-    def by_field(self) -> FieldRenderer:
-        """Renders each field by itself."""
-        options = self.clamped, self.concurrent, self.stack_pixels, self.offload
-        return FieldRenderer(self.fields, self.rasterizer, self.background, *options)
-
-    @property
-    def device(self) -> torch.device:
-        """The device that renders, on which images come out."""
-        return self.by_field.device
-
-    def field(self, level: int) -> GaussianField:
-        """Return a level's field on `device`."""
-        return self.by_field.field(level)
 
     @property
     def finest(self) -> int:
@@ -281,8 +236,8 @@ class HierarchyRenderer:
         if len(needed) > 1:
             return self._compose([camera], needed, gains).residuals[level][0]
         if not needed:
-            return self.by_field.zeros([camera], level)[0]
-        return scaled(self.by_field.render_level([camera], level), gain)[0]
+            return self.zeros([camera], level)[0]
+        return scaled(self.render_level([camera], level), gain)[0]
 
     def _compose(
         self, cameras: Sequence[Camera], levels: Sequence[int], gains: Mapping[int, float], clamped: int | None = None
@@ -293,7 +248,7 @@ class HierarchyRenderer:
             raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
         nested = self.nested  # a nested field's image includes the coarser bands, so none can be omitted
         omitted = [] if nested else [level for level in levels if gains.get(level, 1.0) == 0.0]
-        renders = self.by_field.render(cameras, levels, omitted)
+        renders = self.render_fields(cameras, levels, omitted)
         return compose(self.pyramid, renders, nested=nested, gains=gains, clamped=clamped)
 
     def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:

@@ -100,10 +100,10 @@ def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera
 def _kinds(renderer: HierarchyRenderer, level: int, batches: bool = False) -> Iterator[_Kind]:
     sequential = replace(renderer, concurrent=False)
     ways = {"one after the other": sequential}
-    if renderer.by_field.can_use_streams:
+    if renderer.can_use_streams:
         ways["beside each other"] = replace(renderer, concurrent=True, stack_pixels=0)
     # At any size: these figures show up to which size it is faster.
-    can_stack = renderer.by_field.can_stack
+    can_stack = renderer.can_stack
     stacked = replace(renderer, concurrent=True, stack_pixels=sys.maxsize) if can_stack else None
     if stacked is not None:
         ways["all at once"] = stacked
@@ -135,7 +135,7 @@ def _composing(renderer: HierarchyRenderer, level: int) -> Frame:
 
 
 def _alone(renderer: HierarchyRenderer, level: int, size_level: int) -> Frame:
-    field, background = renderer.field(level), renderer.by_field.background_of(level)
+    field, background = renderer.field(level), renderer.background_of(level)
     return lambda cameras: renderer.rasterizer.render_images(
         field, [level_camera(camera, size_level) for camera in cameras], background=background
     )

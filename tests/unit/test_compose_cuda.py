@@ -125,7 +125,7 @@ def test_a_frame_waits_once_a_field_inside_of_gsplat(
 def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
     """Return the renderer with a stack of its fields, for images of any size."""
     together = replace(renderer, offload=FieldOffload(torch.device("cuda")), stack_pixels=10**9)
-    assert together.by_field.can_stack
+    assert together.can_stack
     return together
 
 
