@@ -5,8 +5,7 @@ From then on the effect of a signal depends on the main thread:
 
 - Outside a command (imports, parsing, exit) there is nothing to clean up: the process prints its line and ends.
 - In a command, `Interrupted` is raised, so that temporary files and child processes are cleaned up. It is not raised
-  during an import, because it would abort the process in C++ frames: a short import is waited for, a long one ends the
-  process.
+  during an import, which compiled modules do not survive: a short import is waited for, a long one ends the process.
 - In training, `stop_request` turns the first signal into a request to stop after the current iteration.
 
 A second signal ends the process immediately with the exit code of the first.
@@ -24,18 +23,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 SAME_PRESS = 0.5
 """Seconds in which another signal counts as the first: wrappers forward a Ctrl-C that the terminal sent to both."""
 
-IMPORT_PATIENCE, IMPORT_POLL = 0.3, 0.02
-"""Seconds to wait for the end of an import before ending without cleanup, and between two checks."""
+RETRY = 0.03
+"""Seconds until an interruption is raised that came during an import, or was lost in a callback of C code."""
 
-SWALLOWED_AGAIN = 0.05
-"""Seconds until an interruption is raised again that was lost in a callback of C code."""
+IMPORT_PATIENCE = 0.3
+"""Seconds to wait for the end of an import before ending without cleanup."""
 
 _SHOW_CURSOR = "\x1b[?25h"  # progress bars hide the cursor
 
@@ -44,87 +43,31 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM inside a command."""
 
 
-class _Interruption:
-    """Handle the signals of this process.
+class StopRequest:
+    """A flag that is set by a request to stop."""
+
+    requested = False
+
+
+class _Process:
+    """The state of signals in this process.
 
     Attributes:
         number: the first signal; None before.
-        installed: whether signals are handled as the module describes.
+        since: when it came.
         in_command: whether a command runs, which may have something to clean up.
-        raised: whether `Interrupted` was raised or will be.
+        raised: whether `Interrupted` was raised in a command or will be.
         advice: what to do after the command was stopped; the line ends with it.
+        said: whether the line was printed.
     """
 
-    def __init__(self) -> None:
-        self.number: int | None = None
-        self.installed = False
-        self.in_command = False
-        self.raised = False
-        self.advice = ""
-        self._since = 0.0
-        self._said = False
-
-    @property
-    def exit_code(self) -> int:
-        return 128 + (signal.SIGINT if self.number is None else self.number)
-
-    def note(self, number: int) -> None:
-        """Remember the first signal."""
-        if self.number is None:
-            self.number, self._since = number, time.monotonic()
-
-    def handle(self, number: int, frame: FrameType | None) -> None:
-        """Handle either signal."""
-        first = self.number is None
-        self.note(number)
-        if first:
-            self.act(frame)
-        elif time.monotonic() - self._since >= SAME_PRESS:
-            self.leave()
-
-    def act(self, frame: FrameType | None) -> None:
-        """End the process or its command, or retry after an import."""
-        if not self.in_command:
-            self.leave()
-        if _importing(frame):
-            if time.monotonic() - self._since > IMPORT_PATIENCE or not hasattr(signal, "setitimer"):
-                self.leave()
-            self.act_later(IMPORT_POLL)
-            return
-        self.raised = True
-        raise Interrupted
-
-    def act_later(self, seconds: float) -> None:
-        """Call `act` again after some seconds."""
-        self.raised = True
-        if hasattr(signal, "setitimer"):  # not on Windows
-            signal.signal(signal.SIGALRM, lambda _, frame: self.act(frame))
-            signal.setitimer(signal.ITIMER_REAL, seconds)
-
-    def cancel(self) -> None:
-        """Cancel `act_later`."""
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-    def print_line(self) -> None:
-        """Print the line, once, without Python's streams, which the signal may have interrupted."""
-        if self._said:
-            return
-        self._said = True
-        name = "SIGTERM" if self.number == signal.SIGTERM else "Ctrl-C"
-        with suppress(OSError):
-            show_cursor = _SHOW_CURSOR if os.isatty(2) else ""
-            os.write(2, f"{show_cursor}lapgs: stopped by {name}{self.advice}\n".encode())
-
-    def leave(self) -> None:
-        """End the process immediately."""
-        self.print_line()
-        with suppress(Exception):  # the signal may have come in the middle of a write
-            sys.stdout.flush()
-        os._exit(self.exit_code)
+    number: int | None = None
+    since = 0.0
+    in_command = raised = said = False
+    advice = ""
 
 
-_interruption = _Interruption()
+_process = _Process()
 
 
 def install() -> None:
@@ -134,12 +77,12 @@ def install() -> None:
     """
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _interruption.handle)
-    _interruption.installed = True
-    # Registered first, so run last: a finalizing interpreter would restore the default handlers.
-    atexit.register(_ignore_signals)
-    sys.unraisablehook = _unraisable
-    if hasattr(signal, "pthread_sigmask"):
+            signal.signal(number, _handle)
+        # Registered first, so run last: a finalizing interpreter would restore the default handlers.
+        atexit.register(signal.signal, number, signal.SIG_IGN)
+    if sys.platform != "win32":
+        signal.signal(signal.SIGALRM, _stop)
+        sys.unraisablehook = _unraisable
         for name in ("create_module", "exec_module"):
             setattr(ExtensionFileLoader, name, _holding_signals(getattr(ExtensionFileLoader, name)))
 
@@ -150,59 +93,32 @@ def command() -> Iterator[None]:
 
     The signal may leave the block as another exception, if C++ or a reader of damaged files translated it.
     """
-    if not _interruption.installed:
-        yield
-        return
-    _interruption.in_command, _interruption.advice = True, ""
+    _process.in_command, _process.advice = True, ""
     try:
         yield
     except BaseException as error:
-        _interruption.in_command = False
-        stopped = isinstance(error, KeyboardInterrupt) or (_interruption.raised and isinstance(error, Exception))
+        stopped = isinstance(error, KeyboardInterrupt) or (_process.raised and isinstance(error, Exception))
         if not stopped or getattr(error, "exit_code", None) == 130:  # an error with a message of its own
             raise
-        _interruption.print_line()
-        sys.exit(_interruption.exit_code)
+    else:
+        if not _process.raised:  # otherwise the command swallowed it, or ended before it was raised
+            return
     finally:
-        _interruption.in_command = False
-        _interruption.cancel()
-    if _interruption.raised:  # the command ended before the signal reached it, or swallowed it
-        _interruption.print_line()
-        sys.exit(_interruption.exit_code)
+        _process.in_command = False
+        if _process.raised:
+            _retry(0.0)
+    _print_line()
+    sys.exit(exit_code(130))
 
 
 def advise(what: str) -> None:
     """Add what to do next to the line of this command, should a signal stop it."""
-    _interruption.advice = f"; {what}"
+    _process.advice = f"; {what}"
 
 
 def exit_code(code: int) -> int:
     """Return the exit code after an error: 143 instead of 130 if SIGTERM stopped the command."""
-    return _interruption.exit_code if code == 130 else code
-
-
-@contextmanager
-def signals_held() -> Iterator[None]:
-    """Block signals in this thread until the block ends, and permanently in threads started inside it.
-
-    Otherwise such a thread could receive a signal while pycolmap's SIGTERM handler is installed, which prints a C++
-    stack.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-class StopRequest:
-    """A flag that is set by a request to stop."""
-
-    def __init__(self) -> None:
-        self.requested = False
+    return 128 + _process.number if code == 130 and _process.number is not None else code
 
 
 @contextmanager
@@ -219,7 +135,7 @@ def stop_request() -> Iterator[StopRequest]:
     def ask(number: int, frame: FrameType | None) -> None:
         if not request.requested:
             request.requested = True
-            _interruption.note(number)
+            _is_first(number)
             return
         before = previous[number]
         if not callable(before):
@@ -234,23 +150,68 @@ def stop_request() -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
 
+def _is_first(number: int) -> bool:
+    """Whether no signal came before this one, which is remembered then."""
+    if _process.number is not None:
+        return False
+    _process.number, _process.since = number, time.monotonic()
+    return True
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    if _is_first(number):
+        _stop(number, frame)
+    elif time.monotonic() - _process.since >= SAME_PRESS:
+        _leave()
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """End the process or its command, or retry after an import."""
+    importing = _importing(frame)
+    late = importing and (sys.platform == "win32" or time.monotonic() - _process.since > IMPORT_PATIENCE)
+    if late or not _process.in_command:
+        _leave()
+    _process.raised = True
+    if not importing:
+        raise Interrupted
+    _retry(RETRY)
+
+
+def _retry(seconds: float) -> None:
+    """Call `_stop` after some seconds; 0 for never."""
+    if sys.platform != "win32":
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
 def _importing(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
         frame = frame.f_back
-    return False
+    return frame is not None
 
 
-def _ignore_signals() -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+def _print_line() -> None:
+    """Print the line, once, without Python's streams, which the signal may have interrupted."""
+    if _process.said:
+        return
+    _process.said = True
+    name = "SIGTERM" if _process.number == signal.SIGTERM else "Ctrl-C"
+    with suppress(OSError):
+        show_cursor = _SHOW_CURSOR if os.isatty(2) else ""
+        os.write(2, f"{show_cursor}lapgs: stopped by {name}{_process.advice}\n".encode())
+
+
+def _leave() -> NoReturn:
+    """End the process immediately."""
+    _print_line()
+    with suppress(Exception):  # the signal may have come in the middle of a write
+        sys.stdout.flush()
+    os._exit(exit_code(130))
 
 
 def _unraisable(unraisable: Any) -> None:
     """Raise an interruption again that was lost in a callback of C code or a finalizer; report others as usual."""
-    if issubclass(unraisable.exc_type, Interrupted) and _interruption.in_command:
-        _interruption.act_later(SWALLOWED_AGAIN)
+    if issubclass(unraisable.exc_type, Interrupted) and _process.in_command:
+        _retry(RETRY)
     else:
         sys.__unraisablehook__(unraisable)
 
@@ -263,13 +224,14 @@ def _holding_signals(load: Callable[[Any, Any], Any]) -> Callable[[Any, Any], An
     """
 
     def held(self: Any, argument: Any) -> Any:
-        with signals_held():
-            try:
-                return load(self, argument)
-            finally:
-                if threading.current_thread() is threading.main_thread():
-                    for number in SIGNALS:
-                        if (handler := signal.getsignal(number)) is not None:
-                            signal.signal(number, handler)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            return load(self, argument)
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                for number in SIGNALS:
+                    if (handler := signal.getsignal(number)) is not None:
+                        signal.signal(number, handler)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
     return held

@@ -17,7 +17,6 @@ import viser
 from PIL import Image
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.interrupt import signals_held
 from lapgs_plugin.viewer.guard import Guard, guarded_server
 from lapgs_plugin.viewer.preview import QUALITY, crop_to_aspect
 
@@ -66,7 +65,6 @@ class Page:
     def __init__(self, host: str, port: int, label: str, preview: Image.Image | None = None) -> None:
         found = free_port(host, port)
         with (
-            signals_held(),  # only the main thread handles signals
             guarded_server(Guard(host)),
             contextlib.redirect_stdout(io.StringIO()),  # viser prints a table of addresses; we print one line
         ):
