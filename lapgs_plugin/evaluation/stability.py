@@ -19,10 +19,11 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.evaluation.figures import require_complete
 from lapgs_plugin.evaluation.metrics import psnr_of
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import Rasterizer, render_depths
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rendering.depth import DepthImage, render_depth
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
@@ -34,7 +35,41 @@ SAME_DEPTH = 0.01
 OPAQUE = 0.9
 """Least opacity of a pixel whose depth is that of a surface."""
 
+SMALLEST_COVER = 1e-6
+"""Least cover by which depths are divided."""
+
 COMPOSITION, SINGLE = "composition", "single field"
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """Depth of a view.
+
+    Attributes:
+        depth: (h, w) along the optical axis, in world units: the mean depth of the Gaussians with their blending
+            weights. Meaningless where nothing covers a pixel.
+        cover: (h, w) sum of these weights, in [0, 1].
+    """
+
+    depth: Tensor
+    cover: Tensor
+
+    def to(self, device: torch.device) -> DepthImage:
+        """Return the depth image on a device."""
+        return DepthImage(self.depth.to(device), self.cover.to(device))
+
+
+@torch.no_grad()
+def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> DepthImage:
+    """Render the depth of a field from a camera, by rendering depths as colours.
+
+    Args:
+        rasterizer: any.
+        field: ordinary or a base; a residual has no depth.
+        camera: on the field's device or the CPU.
+    """
+    weighted, cover = render_depths(rasterizer, field, camera)
+    return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,14 @@
-"""Render a camera path to a video or a folder of numbered images."""
+"""Render a camera path to a video or a folder of numbered images.
+
+Videos are written by the ffmpeg program of imageio-ffmpeg, which gets pixels through a pipe. The alternative, PyAV,
+links FFmpeg and x264, which is GPL, into this process. A separate program does not affect our licence, and its crash is
+an error that we can report. gsplat and nerfstudio use it as well.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import count
@@ -12,22 +17,27 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, require_extra
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.files import whole_file
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.images import around_grey
 from lapgs_plugin.rendering.trajectory import with_size
-from lapgs_plugin.rendering.video import FrameSink, video_writer
-from lapgs_plugin.scenes.images import write_image
+from lapgs_plugin.scenes.images import as_bytes, write_image
 from lapgs_plugin.scenes.resolution import parse_size
 
 VIDEO = ".mp4"
 MIN_SIDE, MAX_SIDE = 16, 16384
 MAX_PENDING = 16
 """Most images that wait to be written; more would only take memory."""
+QUALITY = 8
+"""Quality from 0 to 10 for imageio-ffmpeg, at a variable bit rate."""
+
+FrameSink = Callable[[Tensor], None]
+"""Adds a frame to a clip: an image (3, h, w), clamped to [0, 1]."""
 
 
 def render_size(text: str) -> tuple[int, int]:
@@ -96,7 +106,7 @@ def render_clip(
         LapgsError: the file or folder cannot be written.
     """
     shown = renderer.levels - level + 1 if panels else 1
-    writer = video_writer(out, (size[0] * shown, size[1]), fps) if is_video(out) else _image_writer(out, image_format)
+    writer = _video_writer(out, (size[0] * shown, size[1]), fps) if is_video(out) else _image_writer(out, image_format)
     raw = not is_video(out) and image_format == "exr"
     with item_progress("frames") as progress, writer as write:
         task = progress.add_task(f"Rendering {out.name}", total=len(cameras))
@@ -121,6 +131,60 @@ def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) 
     ]
     shown = residuals if raw else [around_grey(residual) for residual in residuals]
     return torch.cat([base, *shown, whole], dim=2)
+
+
+@contextmanager
+def _video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[FrameSink]:
+    """Write an H.264 video (yuv420p), which every player supports; the file appears when it is complete.
+
+    Args:
+        path: an .mp4 file; missing folders are created.
+        size: (width, height) of every frame, both even.
+        fps: frames a second.
+
+    Raises:
+        LapgsError: the file cannot be written.
+        MissingExtraError: imageio-ffmpeg is not installed.
+    """
+    require_extra("imageio_ffmpeg", "video", f"{path}: a video", "write images with --out FOLDER")
+    import imageio_ffmpeg
+
+    assert size[0] % 2 == size[1] % 2 == 0, "yuv420p has one colour for 2 x 2 pixels"
+    with whole_file(path, "video") as unfinished:
+        writer = imageio_ffmpeg.write_frames(
+            str(unfinished),
+            size,
+            fps=fps,
+            quality=QUALITY,
+            codec="libx264",
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+        )
+        writer.send(None)
+        frames = 0
+
+        def add(image: Tensor) -> None:
+            nonlocal frames
+            frames += 1
+            writer.send(as_bytes(image.clamp(0.0, 1.0)))
+
+        try:
+            yield add
+        finally:
+            writer.close()
+        # On a full disk ffmpeg may end early without an error.
+        if _count_frames(unfinished) != frames:
+            raise OSError("it is truncated")
+
+
+def _count_frames(path: Path) -> int:
+    """Return the number of frames of a video, 0 if the file is not a video."""
+    import imageio_ffmpeg
+
+    try:
+        return int(imageio_ffmpeg.count_frames_and_secs(path)[0]) if path.exists() else 0
+    except RuntimeError:
+        return 0
 
 
 @contextmanager

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from markupsafe import Markup
 
+from lapgs_plugin.errors import FieldError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.splat import splat_bytes
+from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.files import write_text
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.rendering.rig import Rig, forward
@@ -22,6 +24,10 @@ from lapgs_plugin.reports.report import render_page
 TEMPLATE = Path(__file__).with_name("splats.html.jinja")
 NEAREST_TARGET = 0.05
 """Least distance of the point that the view turns around, in distances of the cameras from their focus."""
+INVISIBLE = 1.0 / 255.0
+"""Opacities below this are drawn by no rasterizer."""
+
+LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
 
 
 def write_splat_page(
@@ -50,6 +56,32 @@ def write_splat_page(
     start = json.dumps({**_start(cameras), "background": background, "near": near})
     # Base64 and our own JSON of numbers hold nothing to escape.
     write_text(path, render_page(TEMPLATE, title=title, start=Markup(start), splats=Markup(splats)))
+
+
+def splat_bytes(field: GaussianField) -> bytes:
+    """Return the visible Gaussians of a field as ".splat", the most important first, without SH of degree 1 and higher.
+
+    This compact form of web viewers has 32 bytes a Gaussian: mean and standard deviations as float32, colour and
+    opacity as 8 bits, and a normalised quaternion, wxyz, whose components q are stored as 128 q + 128.
+
+    Raises:
+        FieldError: the field is a residual, or holds NaN or inf.
+    """
+    if field.signed:
+        raise FieldError("a residual has signed colours, which no viewer shows by themselves; merge the run first")
+    field = field.detach().to("cpu", torch.float32)
+    field.require_finite()
+    opacities = torch.sigmoid(field.opacity_logits)
+    importance = opacities.log() + field.log_scales.sum(dim=1)
+    order = importance.argsort(descending=True)
+    order = order[opacities[order] >= INVISIBLE]
+    colors = (0.5 + SH_C0 * field.sh[order, 0]).clamp(0.0, 1.0)
+    quaternions = torch.nn.functional.normalize(field.quaternions[order], dim=1)
+    packed = np.zeros(len(order), LAYOUT)
+    packed["mean"], packed["scale"] = field.means[order].numpy(), field.log_scales[order].exp().numpy()
+    packed["rgba"] = (torch.cat([colors, opacities[order, None]], dim=1) * 255.0).round().numpy()
+    packed["quaternion"] = (quaternions * 128.0 + 128.0).round().clamp(0.0, 255.0).numpy()
+    return packed.tobytes()
 
 
 def _start(cameras: Sequence[Camera]) -> dict[str, Any]:

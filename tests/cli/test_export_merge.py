@@ -17,10 +17,10 @@ from scipy.spatial.distance import cdist
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.splat import splat_bytes
 from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
+from lapgs_plugin.reports.splat_page import splat_bytes
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.training import merge, stage_start, trainer

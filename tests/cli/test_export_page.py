@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import FieldError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.fields.splat import LAYOUT, splat_bytes
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_cameras
+from lapgs_plugin.reports.splat_page import LAYOUT, splat_bytes
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export

@@ -19,10 +19,10 @@ from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample import scene as scene_module
-from lapgs_plugin.scenes.sample.cameras import orbit_camera
 from lapgs_plugin.scenes.sample.points import NOISE
 from lapgs_plugin.scenes.sample.ray_kernels import nearest_hits
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
+from lapgs_plugin.scenes.sample.scene import orbit_camera
 from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
 from lapgs_plugin.scenes.sample.world import build_world
 from tests.folders import snapshot

@@ -11,12 +11,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.evaluation.stability import COMPOSITION, SINGLE, Flicker, Frame, measure_flicker, path_frames
+from lapgs_plugin.evaluation.stability import (
+    COMPOSITION,
+    SINGLE,
+    DepthImage,
+    Flicker,
+    Frame,
+    measure_flicker,
+    path_frames,
+    render_depth,
+)
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
-from lapgs_plugin.rendering.depth import DepthImage, render_depth
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from tests.training_scene import blob_field, ring_camera
 

@@ -17,13 +17,13 @@ from PIL import Image
 
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
+from lapgs_plugin.evaluation.stability import render_depth
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, Rasterizer, RenderResult
 from lapgs_plugin.fields.units import in_unit, unit_of_depth
 from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.rendering.depth import render_depth
 from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.splat_page import write_splat_page
