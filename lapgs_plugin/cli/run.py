@@ -147,6 +147,7 @@ def _execute(
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
+    from lapgs_plugin.runner.context import RunRequest
     from lapgs_plugin.runner.driver import HierarchyDriver
     from lapgs_plugin.runner.installed_packages import explain_import_error
     from lapgs_plugin.runner.recording import BareRunRecorder
@@ -163,18 +164,18 @@ def _execute(
             if options.off:
                 BareRunRecorder(kind(loaded), device, measuring.gpu_busy).run()
                 return
-            driver = HierarchyDriver(
+            request = RunRequest(
                 kind(loaded),
                 settings,
                 device=device,
                 resume=options.resume,
                 overwrite=options.overwrite,
-                watcher=watcher,
                 measuring=measuring,
+                watcher=watcher,
             )
-            driver.run()
-        if driver.folder is not None:
-            save_run_preview(driver.folder, device)
+            folder = HierarchyDriver(request).run()
+        if folder is not None:
+            save_run_preview(folder, device)
     except ImportError as error:
         line = None if options.off else explain_import_error(error, script, on_cpu=device == "cpu")
         if line is None:

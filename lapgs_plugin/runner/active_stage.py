@@ -61,10 +61,10 @@ class ActiveStage(RunningStage):
         before: StageResult | None,
     ) -> None:
         self._views = StageViews(run, window.stage, call, None if before is None else before.predictions)
-        record = StageRecord(run.archive, window, run.context.parts, run.context.measuring.gpu_busy)
+        record = StageRecord(run.archive, window, run.context.parts, run.context.request.measuring.gpu_busy)
         super().__init__(window.stage, self._views.rendering, record)
         self._context, self._run, self.window, self._finished, self._call = run.context, run, window, finished, call
-        self._options, self._adapter, self._archive = run.context.options, run.context.adapter, run.archive
+        self._options, self._adapter, self._archive = run.settings, run.context.adapter, run.archive
         self._model = StageModel(run, self.stage, before)
         self._joint: JointLevels | None = None
         self._joint_from = self._options.joint_from(self.stage)
@@ -124,7 +124,7 @@ class ActiveStage(RunningStage):
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
         self._context.parts.breakdown.mark("other")
-        every = self._context.measuring.test_every
+        every = self._context.request.measuring.test_every
         if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
             elapsed = self.record.elapsed_in_run()
             with self.record.outside("evaluation"):
@@ -168,7 +168,7 @@ class ActiveStage(RunningStage):
         self._log_start()
         self.record.start()
         self._context.hooks.on_stage_start(self.stage)
-        self._context.watcher.stage_started(self.stage)
+        self._context.request.watcher.stage_started(self.stage)
 
     def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
         """Check that the script's call, which has returned, trained this stage, the last one that it trains.
@@ -205,13 +205,13 @@ class ActiveStage(RunningStage):
         inherited = {"carried": self._model.carried(gaussians), "moments": self._model.moments(gaussians)}
         result = self._result(gaussians, field, **inherited)
         self.record.archive(field, inherited, joint)
-        if self._views.test and (self.stage.level <= 1 or self._context.measuring.test_every is not None):
+        if self._views.test and (self.stage.level <= 1 or self._context.request.measuring.test_every is not None):
             self._evaluate(gaussians)
         psnr = last_psnr(self._archive.history()) if self.stage.level == 0 else {}
         for line in weak_levels(self._archive.manifest.records[-1:], psnr):
             logger.warning("%s", line)
         self._compare(gaussians, field)
-        self._context.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
+        self._context.request.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
         return result
 
     def _finish_despite(self, error: Exception) -> None:
@@ -288,7 +288,7 @@ class ActiveStage(RunningStage):
 
     def _show(self, gaussians: Any, iteration: int) -> None:
         """Show the fields after an iteration to the run's watcher if it wants to look."""
-        watcher = self._context.watcher
+        watcher = self._context.request.watcher
         if watcher.wants_look():
             with self.record.outside("view"):
                 watcher.look(self.stage, iteration, lambda: self._fields(gaussians), lambda: False)

@@ -1,9 +1,11 @@
-"""Hold the objects that the stages of a run over a checkout share, and the results that they hand on."""
+"""Hold what a user asks of a run over a checkout, what its stages share, and the results that they hand on."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,13 +16,16 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.level_views import SceneImages
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
+from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.archived_values import ADAPTER_MENDS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
@@ -35,26 +40,52 @@ from lapgs_plugin.runs.watcher import Watcher
 logger = logging.getLogger(__name__)
 
 
-@dataclass
-class CheckoutContext:
-    """Hold the objects of a run that exist before the script's main block starts; see `HierarchyDriver`.
+@dataclass(frozen=True)
+class RunRequest:
+    """Hold what a user asks of a run over a checkout; the script's own call of `training` says the rest.
 
     Attributes:
-        options: of the hierarchy; once the photos are read, with the defaults for their size.
-        stages: hold the running stage, or that of the dry run.
+        adapter: of the script's backbone.
+        settings: of the hierarchy.
+        device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
+        resume: continue the run in the output folder.
+        overwrite: replace the run in the output folder.
+        hooks: run after those registered by entry point.
+        measuring: which figures are measured.
+        watcher: may look at the fields between iterations.
     """
 
     adapter: BackboneAdapter
-    options: RunSettings
-    device: torch.device
-    images: SceneImages
-    stages: Stages
-    wrapper: RasterizerWrapper
-    hooks: HookCaller
-    parts: IterationParts
-    watcher: Watcher
-    measuring: MeasuringOptions
-    _told: set[str] = field(default_factory=set)
+    settings: RunSettings = field(default_factory=RunSettings)
+    device: str = "cuda"
+    resume: bool = False
+    overwrite: bool = False
+    hooks: Sequence[StageHook] = ()
+    measuring: MeasuringOptions = field(default_factory=MeasuringOptions)
+    watcher: Watcher = field(default_factory=Watcher)
+
+
+class CheckoutContext:
+    """Hold the objects of a run that exist before the script's main block starts.
+
+    Args:
+        request: what the user asks for.
+
+    Attributes:
+        stages: hold the running stage, or that of the dry run.
+        began: file-system time (ns) just before the main block.
+    """
+
+    def __init__(self, request: RunRequest) -> None:
+        self.request, self.adapter, self.device = request, request.adapter, torch.device(request.device)
+        self.images, self.stages = SceneImages(), Stages()
+        self.parts = IterationParts(self.device, request.measuring.breakdown)
+        visibility = EarlyVisibility() if request.settings.run_ahead else None
+        self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, visibility)
+        self.hooks = HookCaller(self.stages, request.hooks, request.settings.hooks)
+        with tempfile.TemporaryFile() as file:  # its clock is behind `time.time_ns`
+            self.began = os.fstat(file.fileno()).st_mtime_ns
+        self._told: set[str] = set()
 
     def compare(self, captured: Captured, field: GaussianField, *, residual_follows: bool, state: str = "") -> None:
         """Compare what the checkout renders of a model with its archived field, and warn once if they differ.
@@ -72,8 +103,8 @@ class CheckoutContext:
 
     def window(self, plan: StagePlan, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""
-        options, start = self.options, plan.iterations_before(stage.level)
-        factors = options.color_factor, options.threshold_factor(stage)
+        settings, start = self.request.settings, plan.iterations_before(stage.level)
+        factors = settings.color_factor, settings.threshold_factor(stage)
         return StageWindow(stage, start, plan.iterations, plan.levels, *factors)
 
     def render(
@@ -103,20 +134,29 @@ class CheckoutContext:
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Hold the objects of a run that exist once the script has called `training`.
+    """Hold a run that is ready to train, once the script has called `training`. `preparation.prepare` makes it.
 
     Attributes:
+        settings: those of the request, with the defaults for the photos' size.
         call: for the whole run.
         scene_files: folder of the files that the checkout's Scene wrote beside a model, for its viewers.
-        archive: open for writing.
+        plan: the stages.
+        schedule: of the script's training function.
+        color_path: how the checkout's rasterizer evaluates signed colour.
+        folder: run folder, as the script got it.
+        archive: the same folder, open for writing.
     """
 
     context: CheckoutContext
+    settings: RunSettings
     call: TrainingCall
     scene: CheckoutScene
     scene_files: Path
-    archive: RunArchive
+    plan: StagePlan
+    schedule: Schedule
     color_path: ColorPath
+    folder: Path
+    archive: RunArchive
 
 
 @dataclass(frozen=True)

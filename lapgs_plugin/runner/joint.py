@@ -59,7 +59,7 @@ class JointLevels:
 
     def __init__(self, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews) -> None:
         self._context, self._run, self._views = run.context, run, views
-        self._pyramid = Pyramid(run.context.options.grid)
+        self._pyramid = Pyramid(run.settings.grid)
         self._fields = [self._load(one) for one in finished]
 
     def _load(self, finished: FinishedStage) -> _JointField:

@@ -79,7 +79,7 @@ class StageReplacements:
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
         control = dict.fromkeys(profile.density_control, self._make_density_control)
-        if not self._context.options.prune_by_size:
+        if not self._context.request.settings.prune_by_size:
             methods = {name: inspect.signature(getattr(profile.model, name)) for name in control}
             limited = [name for name, signature in methods.items() if SIZE_LIMIT in signature.parameters]
             if not limited:
@@ -104,7 +104,7 @@ class StageReplacements:
         return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in found]
 
     def _in_losses(self, profile: Profile) -> list[Replacement]:
-        if not self._context.options.fused_ssim:
+        if not self._context.request.settings.fused_ssim:
             return []
         found = [place for place in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*place))]
         return [Replacement(*place, checkout_ssim.in_our_kernels, "training() in its loss") for place in found]
@@ -169,7 +169,7 @@ class StageReplacements:
         @wraps(original)
         def reset_opacity(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             # Against floaters near cameras, the base's resets are enough.
-            if self._context.options.residual_resets or not self._in_residual():
+            if self._context.request.settings.residual_resets or not self._in_residual():
                 return control(gaussians, *args, **kwargs)
             return None
 

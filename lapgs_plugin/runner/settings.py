@@ -85,6 +85,11 @@ class RunSettings(HierarchySettings):
         return (Fraction(1, 3 * coarser),) * coarser + (Fraction(2, 3),)
 
     @property
+    def has_residuals(self) -> bool:
+        """Whether some fields are residuals; without any, one call of the script's `training` trains all levels."""
+        return self.levels > 1 and not self.nested
+
+    @property
     def joint_share(self) -> float:
         """See `HierarchySettings.joint_share`."""
         return super().joint_share if self.nested or self.joint is not None else SMALL_JOINT_SHARE

@@ -19,7 +19,7 @@ import torch
 from lapgs_plugin.checkouts.attachment import Attachment, of_class
 from lapgs_plugin.checkouts.training_call import CHECKPOINTS, StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.plan import Stage, StagePlan
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.stage_model import StageModel
@@ -86,13 +86,13 @@ class SingleCall:
     """Train all nested levels of a run that are not in its archive.
 
     Args:
-        run, plan: the run.
+        run: the run.
     """
 
-    def __init__(self, run: TrainingRun, plan: StagePlan) -> None:
-        self._context, self._run, self._plan = run.context, run, plan
+    def __init__(self, run: TrainingRun) -> None:
+        self._context, self._run, self._plan = run.context, run, run.plan
         finished = len(run.archive.available_levels)
-        self._done, self._left = list(plan)[:finished], list(plan)[finished:]
+        self._done, self._left = list(run.plan)[:finished], list(run.plan)[finished:]
         # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
         self._call = run.call.copied()
         self._call.dataset.model_path = str(run.archive.path("level_0"))

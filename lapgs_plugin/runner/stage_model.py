@@ -27,7 +27,7 @@ class StageModel:
     """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
 
     def __init__(self, run: TrainingRun, stage: Stage, before: StageResult | None) -> None:
-        self._options, self._adapter, self._device = run.context.options, run.context.adapter, run.context.device
+        self._options, self._adapter, self._device = run.settings, run.context.adapter, run.context.device
         self._scene, self._stage, self._before = run.scene, stage, before
         self._kept: Tensor  # (n,) Gaussians of the level before that are inherited
 

@@ -49,15 +49,16 @@ class StageViews:
         predictions: UpsampledImages | None,
     ) -> None:
         self._context, self._call, self._stage, self._predictions = run.context, call, stage, predictions
-        context = run.context
-        full, options, supervision = context.images, context.options, SUPERVISIONS[context.options.supervision]
+        context, settings = run.context, run.settings
+        full, supervision = context.images, SUPERVISIONS[settings.supervision]
         train, test = ({full.key(each): each for each in cameras} for cameras in (run.scene.train, run.scene.test))
         self.cameras, self.train, self.test = {**train, **test}, list(train), list(test)
-        self._pyramid = Pyramid(options.grid)
+        self._pyramid = Pyramid(settings.grid)
         self._views: dict[str, Any] = {}
         self._changed: dict[str, set[str]] = {}  # attributes of each view that depend on the level
         sizes, folder = [full[key].size for key in self.cameras], run.archive.path(CACHE)
-        self._stores = ImageStores(sizes, context.device, full.exact, options.images_on, folder)
+        self._precision = chosen_precision(settings.prediction_precision, context.device)
+        self._stores = ImageStores(sizes, context.device, full.exact, settings.images_on, folder)
         self.images = LevelImages(
             self._stores,
             stage.level,
@@ -104,8 +105,7 @@ class StageViews:
     def predict(self, gaussians: Any) -> UpsampledImages:
         """Return the composed image of every view for the next level."""
         level = self._stage.level
-        precision = chosen_precision(self._context.options.prediction_precision, self._device)
-        predictions = self._stores.make_upsampled(level, precision, f"predictions_{level}", self._pyramid)
+        predictions = self._stores.make_upsampled(level, self._precision, f"predictions_{level}", self._pyramid)
         for key in self.cameras:
             width, height = self.size(key, level - 1)
             predictions.put(key, self._composed(gaussians, key), (height, width))

@@ -30,6 +30,7 @@ from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rendering.run import run_renderer, run_scene
+from lapgs_plugin.runner.context import RunRequest
 from lapgs_plugin.runner.driver import HierarchyDriver
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
@@ -240,16 +241,16 @@ def drive(
     options.setdefault("dry_run", False)
     if options["hierarchy"] == "laplacian" and options.get("levels", 2) == 2:
         options = {**THIRDS, **options}
-    driver = HierarchyDriver(
+    request = RunRequest(
         adapter,
         RunSettings(**options),
         device="cpu",
         resume=resume,
         hooks=hooks,
         measuring=MeasuringOptions(test_every=test_every, breakdown=breakdown, gpu_busy=gpu_busy),
-        watcher=watcher,
+        watcher=watcher or Watcher(),
     )
-    driver.run()
+    HierarchyDriver(request).run()
 
 
 def run_hierarchy(

@@ -163,11 +163,12 @@ class Points(NamedTuple):
 def test_points_of_a_residual_have_what_a_fork_has_of_points() -> None:
     given: list[Points] = []
     points = Points(np.ones((7, 3)), np.ones((7, 3)), None, np.ones((7, 2), np.float32), "viridis")
-    context = SimpleNamespace(options=RunSettings(inherit="xyz"), adapter=None, device=None)
+    settings, context = RunSettings(inherit="xyz"), SimpleNamespace(adapter=None, device=None)
     model = SimpleNamespace(create_from_pcd=lambda cloud, *others: given.append(cloud))
     field = some_field(5)
     stage, before = Stage(0, (8, 6), 20, signed=True), StageResult(field, None, {}, {})
-    run: Any = SimpleNamespace(context=context, scene=SimpleNamespace(points=points, others=(1.0,)))
+    scene = SimpleNamespace(points=points, others=(1.0,))
+    run: Any = SimpleNamespace(context=context, settings=settings, scene=scene)
     StageModel(run, stage, before).initialise(model)
     (cloud,) = given
     np.testing.assert_array_equal(cloud.points, field.means.double().numpy())

@@ -20,9 +20,8 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runner import joint
-from lapgs_plugin.runner.context import CheckoutContext
+from lapgs_plugin.runner.context import CheckoutContext, RunRequest
 from lapgs_plugin.runner.joint import JointLevels
-from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
@@ -63,9 +62,8 @@ def test_renders_of_one_colour_share_their_background() -> None:
         given.append(background)
         rendering.captured = torch.zeros(3, 2, 2)
 
-    others: dict[str, Any] = dict.fromkeys(("options", "images", "wrapper", "hooks", "parts", "watcher", "measuring"))
     adapter: Any = SimpleNamespace(render=render)
-    context: Any = CheckoutContext(adapter=adapter, device=torch.device("cpu"), stages=Stages(), **others)
+    context: Any = CheckoutContext(RunRequest(adapter, device="cpu"))
     for white, black in ((True, False), (False, False), (True, True), (True, False)):
         with torch.inference_mode(not given):
             context.render(rendering, SimpleNamespace(white_background=white), None, None, black=black)

@@ -10,7 +10,7 @@ from typing import Any
 
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.hierarchy.plan import Hierarchy, Stage, StagePlan
-from lapgs_plugin.runner.driver import between_events
+from lapgs_plugin.runner.preparation import between_events
 
 LOOP = """
 def training(opt, args, testing_iterations, seen, unused=None):

@@ -1,0 +1,128 @@
+"""Prepare a run over a checkout: decide and check what a user and the script ask for, before a run folder is made."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from lapgs_plugin.checkouts.schedule import Schedule
+from lapgs_plugin.checkouts.training_call import TrainingCall
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.files import is_folder
+from lapgs_plugin.hierarchy.plan import StagePlan
+from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.context import CheckoutContext, TrainingRun
+from lapgs_plugin.runner.dry_run import DryRun
+from lapgs_plugin.runner.manifest import make_manifest, require_same_run
+from lapgs_plugin.runner.stage_pruning import require_pruning
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import require_place, require_utf8
+from lapgs_plugin.runs.manifest import Manifest
+
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRun]:
+    """Yield a run that is ready to train. Its folder is locked for writing inside the block.
+
+    The cheapest checks come first. The folder of a new run is made last, with its manifest.
+
+    Args:
+        context: of the run, whose replacements in `training` are attached.
+        call: the script's call of `training`.
+
+    Raises:
+        LapgsError: the checkout, its options, the scene, the run folder and the hierarchy do not go together.
+    """
+    request, adapter, images = context.request, context.adapter, context.images
+    settings = request.settings
+    adapter.refuse(call, settings.has_residuals)
+    require_pruning(call, settings.prune, adapter.profile.model)
+    folder, scene_folder = Path(call.dataset.model_path or _default_folder()), Path(call.dataset.source_path)
+    absolute = folder.absolute()
+    if not request.resume:
+        RunArchive.require_room(folder, request.overwrite, context.began)
+        require_place(folder, "-m")
+        require_utf8(folder, "-m")
+    if not scene_folder.exists():
+        raise UserInputError(
+            f"the scene {scene_folder} does not exist; give the script its folder, as in -s data/garden"
+        )
+    if settings.images_on == "disk":  # that of the run: the one of temporary files may be in memory
+        images.keep_on_disk(next(filter(is_folder, (absolute, *absolute.parents))))
+    with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
+        scene = CheckoutScene.load(call, adapter, Path(scratch))
+        scene.check_points()
+        images.read_masks(scene_folder, settings.masks)
+        adapter.first_points(len(scene.points.points))
+        size = images.smallest_size()
+        settings = settings.for_size(size)
+        plan = StagePlan.create(size, call.opt.iterations, settings.levels, settings.shares, settings.kind)
+        schedule = Schedule(adapter.profile.source.training)
+        if not settings.has_residuals:
+            plan = between_events(plan, schedule, call.variables)
+        dry_run = DryRun(context, call, scene, plan, schedule)
+        path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
+        if settings.dry_run:
+            dry_run.run(Path(scratch, "dry_run"), path)
+        elif not settings.has_residuals and (context.hooks or images.masked):
+            dry_run.find_image()
+        manifest = make_manifest(adapter, settings, call, plan, bool(scene.test))
+        with _open_archive(context, absolute, manifest) as archive:
+            yield TrainingRun(context, settings, call, scene, Path(scratch), plan, schedule, path, folder, archive)
+
+
+def _open_archive(context: CheckoutContext, folder: Path, manifest: Manifest) -> RunArchive:
+    """Create the run folder, or open it to continue the run.
+
+    Raises:
+        RunFolderError: it is in use, or was started with other options.
+    """
+    if not context.request.resume:
+        return RunArchive.create(folder, manifest, context.request.overwrite, context.began)
+    archive = RunArchive.open(folder, resume=True)
+    try:
+        require_same_run(archive.manifest, manifest)
+        if archive.manifest.complete:
+            logger.info("the run in %s is finished: nothing is left to train", folder)
+    except BaseException:
+        archive.close()
+        raise
+    return archive
+
+
+def between_events(plan: StagePlan, schedule: Schedule, variables: Mapping[str, Any]) -> StagePlan:
+    """Return a plan in which no nested level is archived right after a reset of opacities or hard pruning.
+
+    The iterations that a level loses go to the next finer one.
+
+    Args:
+        plan: of nested levels.
+        schedule: of the script.
+        variables: those that its training function sees, by name.
+    """
+    before, stages = 0, list(plan)
+    for i in range(len(stages) - 1):
+        stage, finer = stages[i], stages[i + 1]
+        end = before + stage.iterations
+        clear = schedule.before_harm(end, variables, plan.iterations)
+        if before < clear < end:
+            logger.info("level %d ends after iteration %d: the script acts at %d", stage.level, clear, clear + 1)
+            stages[i] = replace(stage, iterations=clear - before)
+            stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
+        before += stages[i].iterations
+    return replace(plan, stages=tuple(stages))
+
+
+def _default_folder() -> str:
+    """Return the output folder that checkouts choose without -m."""
+    return str(Path("output") / (os.getenv("OAR_JOB_ID") or str(uuid.uuid4())[:10]))
