@@ -92,7 +92,7 @@ def run(
     import logging
 
     from lapgs_plugin.checkouts.script import require_script
-    from lapgs_plugin.checkouts.source import CheckoutSource
+    from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
     from lapgs_plugin.environment.device import chosen_device
     from lapgs_plugin.runner.installed_packages import require_packages
 
@@ -104,11 +104,13 @@ def run(
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
     # What is refused by the sources alone is refused before PyTorch is imported.
     path, words = require_script(script), arguments or []
-    kind, root = _recognised(script, options.backbone, needed=not plain)
+    kind = _recognised(script, options.backbone, needed=not plain)
     if kind is not None and not options.off:
-        _require_levels(script, kind)
+        source = CheckoutSource.read(script)
+        if why := source.hindrance(kind.archived_parameters()):
+            raise UserInputError(f"{script} cannot be trained in levels: {why}; {OTHERWISE}")
         if not isinstance(context.obj, Rehearsal):
-            require_packages(CheckoutSource.read(script), options.device)
+            require_packages(source, options.device)
     device = chosen_device(options.device, "--device cpu runs the checkout on CPU stand-ins")
     if measuring.gpu_busy:
         from lapgs_plugin.runs.gpu_busy import require_cuda
@@ -123,14 +125,13 @@ def run(
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.WARNING)  # of the preview
     attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
     attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
-    _execute(path, words, kind, root, device, options, settings, measuring, watcher)
+    _execute(path, words, kind, device, options, settings, measuring, watcher)
 
 
 def _execute(
     script: Path,
     arguments: Sequence[str],
     kind: type[BackboneAdapter] | None,
-    root: Path,
     device: str,
     options: ScriptOptions,
     settings: RunSettings,
@@ -142,8 +143,8 @@ def _execute(
 
     variant, neighbours = None, False
     if device == "cpu" and kind is not None:
-        variant = kind.stand_in_for(root, arguments)
-        neighbours = CheckoutSource.read(script).unpacks("distCUDA2")
+        source = CheckoutSource.read(script)
+        variant, neighbours = kind.stand_in_for(source.root, arguments), source.unpacks("distCUDA2")
     from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
@@ -183,26 +184,13 @@ def _execute(
         raise line from error
 
 
-def _require_levels(script: Path, kind: type[BackboneAdapter]) -> None:
-    """Refuse a checkout without levels by its sources, before its packages are missed.
-
-    Raises:
-        UserInputError: it cannot be trained in levels.
-    """
-    from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
-
-    if why := CheckoutSource.read(script).hindrance(kind.archived_parameters()):
-        raise UserInputError(f"{script} cannot be trained in levels: {why}; {OTHERWISE}")
-
-
-def _recognised(script: Path, backbone: str | None, *, needed: bool) -> tuple[type[BackboneAdapter] | None, Path]:
-    """Return the adapter of a script's checkout, None for another script if none is needed, and the checkout's root."""
+def _recognised(script: Path, backbone: str | None, *, needed: bool) -> type[BackboneAdapter] | None:
+    """Return the adapter of a script's checkout; None for another script if none is needed."""
     from lapgs_plugin.checkouts.source import CheckoutSource
 
     try:
-        root = CheckoutSource.read(script).root
-        return adapter_class(root, backbone), root
+        return adapter_class(CheckoutSource.read(script).root, backbone)
     except UserInputError:
         if needed or backbone is not None:
             raise
-        return None, script.parent
+        return None

@@ -139,24 +139,24 @@ class TrainingRun:
     Attributes:
         settings: those of the request, with the defaults for the photos' size.
         call: for the whole run.
-        scene_files: folder of the files that the checkout's Scene wrote beside a model, for its viewers.
         plan: the stages.
         schedule: of the script's training function.
         color_path: how the checkout's rasterizer evaluates signed colour.
-        folder: run folder, as the script got it.
-        archive: the same folder, open for writing.
+        archive: the run folder, open for writing.
+        folder: its path as the user typed it.
+        scene_files: folder of the files that the checkout's Scene wrote beside a model, for its viewers.
     """
 
     context: CheckoutContext
     settings: RunSettings
     call: TrainingCall
     scene: CheckoutScene
-    scene_files: Path
     plan: StagePlan
     schedule: Schedule
     color_path: ColorPath
-    folder: Path
     archive: RunArchive
+    folder: Path
+    scene_files: Path
 
 
 @dataclass(frozen=True)

@@ -47,22 +47,20 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
     settings = request.settings
     adapter.refuse(call, settings.has_residuals)
     require_pruning(call, settings.prune, adapter.profile.model)
-    folder, scene_folder = Path(call.dataset.model_path or _default_folder()), Path(call.dataset.source_path)
+    folder, source = Path(call.dataset.model_path or _default_folder()), Path(call.dataset.source_path)
     absolute = folder.absolute()
     if not request.resume:
         RunArchive.require_room(folder, request.overwrite, context.began)
         require_place(folder, "-m")
         require_utf8(folder, "-m")
-    if not scene_folder.exists():
-        raise UserInputError(
-            f"the scene {scene_folder} does not exist; give the script its folder, as in -s data/garden"
-        )
+    if not source.exists():
+        raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
     if settings.images_on == "disk":  # that of the run: the one of temporary files may be in memory
         images.keep_on_disk(next(filter(is_folder, (absolute, *absolute.parents))))
     with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:
         scene = CheckoutScene.load(call, adapter, Path(scratch))
         scene.check_points()
-        images.read_masks(scene_folder, settings.masks)
+        images.read_masks(source, settings.masks)
         adapter.first_points(len(scene.points.points))
         size = images.smallest_size()
         settings = settings.for_size(size)
@@ -78,7 +76,8 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
             dry_run.find_image()
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test))
         with _open_archive(context, absolute, manifest) as archive:
-            yield TrainingRun(context, settings, call, scene, Path(scratch), plan, schedule, path, folder, archive)
+            files = {"folder": folder, "scene_files": Path(scratch)}
+            yield TrainingRun(context, settings, call, scene, plan, schedule, path, archive, **files)
 
 
 def _open_archive(context: CheckoutContext, folder: Path, manifest: Manifest) -> RunArchive:

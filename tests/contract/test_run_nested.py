@@ -22,7 +22,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rasterizers.choice import rasterizer_for
 from lapgs_plugin.rendering.run import run_scene
-from lapgs_plugin.runner import driver
+from lapgs_plugin.runner.dry_run import DryRun
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.scenes import load_scene
@@ -131,7 +131,7 @@ def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[s
         if name not in made:
             folder = tmp_path_factory.mktemp(name) / "run"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(driver.DryRun, "color_path", unasked)
+                patch.setattr(DryRun, "color_path", unasked)
                 seen = run_watched(name, scene, folder, *WHITE)
             made[name] = RunArchive.open(folder), seen
         return made[name]
