@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment
-from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
+from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import CheckoutContext, FinishedStage, RunRequest, StageResult, TrainingRun
 from lapgs_plugin.runner.dry_run import undisturbed
@@ -96,24 +96,19 @@ def _train_run(run: TrainingRun) -> Any:
 
 
 def _run_stages(run: TrainingRun) -> Any:
-    """Train or restore all stages, each by its own call, and return what the last call returned."""
-    finished: list[FinishedStage] = []
+    """Train or restore all stages, each by a call of its own length, and return what the last call returned."""
+    adapter, finished = run.context.adapter, list[FinishedStage]()
     before: StageResult | None = None
     for stage in run.plan:
         window = run.context.window(run.plan, stage)
-        call = _stage_call(run, window)
+        # Arguments are the adapter's to change, all else is what the script's tree says.
+        call = adapter.stage_call(run.call, window, str(run.archive.path(f"level_{stage.level}")))
+        changed = run.schedule.for_stage(run.call.variables, call.values, window, adapter.info.unscaled)
+        if changed.notes:
+            logger.info("level %d, schedule: %s", stage.level, ", ".join(changed.notes))
+        call = changed.applied_to(call)
         active = ActiveStage(run, window, call, tuple(finished), before)
         with run.context.stages.run(active):
             before = active.restore() if stage.level in run.archive.available_levels else active.train()
         finished.append(FinishedStage(stage, call))
     return active.returned
-
-
-def _stage_call(run: TrainingRun, window: StageWindow) -> TrainingCall:
-    """Return the call for a stage of its own length: arguments by the adapter, all else by the script's tree."""
-    level, adapter = window.stage.level, run.context.adapter
-    call = adapter.stage_call(run.call, window, str(run.archive.path(f"level_{level}")))
-    changed = run.schedule.for_stage(run.call.variables, call.values, window, adapter.info.unscaled)
-    if changed.notes:
-        logger.info("level %d, schedule: %s", level, ", ".join(changed.notes))
-    return changed.applied_to(call)

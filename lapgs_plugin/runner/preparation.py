@@ -47,7 +47,8 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
     settings = request.settings
     adapter.refuse(call, settings.has_residuals)
     require_pruning(call, settings.prune, adapter.profile.model)
-    folder, source = Path(call.dataset.model_path or _default_folder()), Path(call.dataset.source_path)
+    unnamed = Path("output", os.getenv("OAR_JOB_ID") or str(uuid.uuid4())[:10])  # as checkouts choose without -m
+    folder, source = Path(call.dataset.model_path or unnamed), Path(call.dataset.source_path)
     absolute = folder.absolute()
     if not request.resume:
         RunArchive.require_room(folder, request.overwrite, context.began)
@@ -76,8 +77,9 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
             dry_run.find_image()
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test))
         with _open_archive(context, absolute, manifest) as archive:
-            files = {"folder": folder, "scene_files": Path(scratch)}
-            yield TrainingRun(context, settings, call, scene, plan, schedule, path, archive, **files)
+            yield TrainingRun(
+                context, settings, call, scene, plan, schedule, path, archive, folder=folder, scene_files=Path(scratch)
+            )
 
 
 def _open_archive(context: CheckoutContext, folder: Path, manifest: Manifest) -> RunArchive:
@@ -120,8 +122,3 @@ def between_events(plan: StagePlan, schedule: Schedule, variables: Mapping[str, 
             stages[i + 1] = replace(finer, iterations=finer.iterations + end - clear)
         before += stages[i].iterations
     return replace(plan, stages=tuple(stages))
-
-
-def _default_folder() -> str:
-    """Return the output folder that checkouts choose without -m."""
-    return str(Path("output") / (os.getenv("OAR_JOB_ID") or str(uuid.uuid4())[:10]))
