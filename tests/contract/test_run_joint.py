@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
+from lapgs_plugin.hierarchy import settings
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hooks import StageContext, StageHook
@@ -128,6 +129,18 @@ def test_finished_fields_follow_optimizers_that_a_loop_makes_in_the_middle(
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         drive_residuals(adapter, joint=0.5)
     assert len(steps) == 9, "in iterations 11 to 19; after its last the checkout does not step"
+
+
+@pytest.mark.parametrize(("large", "share", "count"), [(100 * 100, 0.5, 9), (10 * 10, 0.25, 4)])
+def test_the_default_share_follows_from_the_photos_size(
+    large: int, share: float, count: int, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+    step = joint._follow
+    monkeypatch.setattr(joint, "_follow", lambda *given: (step(*given), steps.append(1)))
+    monkeypatch.setattr(settings, "LARGE_IMAGE", large)  # photos have 64 x 48 pixels
+    archive, _ = run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT)
+    assert (archive.manifest.settings["joint"], len(steps)) == (share, count)  # of 20 iterations, without the last
 
 
 class Inspected:
