@@ -91,7 +91,7 @@ def append_rows(path: Path, rows: Sequence[Row]) -> None:
     if is_folder(path):
         raise UserInputError(f"--csv {path} is a folder; expected a file, or a name for a new one")
     text = read_text(path, advice="name another file") if is_file(path) else ""
-    header = text.removeprefix("\ufeff").partition("\n")[0].strip()
+    header = text.partition("\n")[0].strip()
     if text and [name.strip('"') for name in header.split(",")] != list(COLUMNS):
         raise UserInputError(
             f"--csv {path} has the columns {shortened(header)}, expected {','.join(COLUMNS)}; name another file"

@@ -75,8 +75,8 @@ def test_a_row_has_the_figures_of_its_run(runs: Path, scene: Path, tmp_path: Pat
 
 def test_rows_are_appended_run_first_and_unknown_values_are_empty(runs: Path, tmp_path: Path) -> None:
     file = tmp_path / "data.csv"
-    before = f"\ufeff{HEADER}\r\nbonsai,255,800,533,30000,FastGS,0,173.1,,31.7,,,,,"  # of a spreadsheet, no line end
-    file.write_text(before, newline="")
+    before = f"{HEADER}\r\nbonsai,255,800,533,30000,FastGS,0,173.1,,31.7,,,,,"  # of a spreadsheet, no line end
+    file.write_text(before, encoding="utf-8-sig", newline="")
     for name in ("nested", "laplacian", "one field"):
         change(runs / name / "metrics.json", gpu_busy_seconds=None, peak_memory_bytes=None, lpips_vgg=0.5)
     lapgs("report", runs / "nested", "--baseline", runs / "one field", "--csv", file)
