@@ -34,8 +34,8 @@ def weak_levels(records: Sequence[LevelRecord], psnr: Mapping[int, float], views
     if psnr.keys() >= {0, 1} and (gain := psnr[0] - psnr[1]) < SMALL_GAIN:
         lines.append(
             f"level 0 changes the PSNR of {views} images by {gain:+.2f} dB, from {psnr[1]:.2f} to {psnr[0]:.2f}: by "
-            "this measure it adds little to the coarser level's, enlarged; compare their LPIPS, fewer levels or the other "
-            "hierarchy"
+            "this measure it adds little to the coarser level's, enlarged; compare their LPIPS, fewer levels or the "
+            "other hierarchy"
         )
     return lines
 
