@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lapgs_plugin.errors import SceneError, UserInputError
+from lapgs_plugin.errors import SceneError, TrainingStoppedError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.evaluation.stability import render_depth
 from lapgs_plugin.fields.camera import Camera
@@ -33,10 +33,11 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.runs.training_figures import weak_levels
 from lapgs_plugin.scenes.scene import Scene, load_scene
+from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
-from tests.training_runs import Said, placed
+from tests.training_runs import Said, StopAt, placed, plys, resume
 from tests.training_scene import HEIGHT, WIDTH, blob_field, ring_camera, ring_scene
 
 BLACK = torch.zeros(3)
@@ -70,12 +71,16 @@ def write_ring(folder: Path, scale: float = 1.0, points: np.ndarray | None = Non
     return folder
 
 
-def train(folder: Path, scene: Scene, **options: Any) -> tuple[RunArchive, list[str]]:
-    settings = TrainSettings(**{"iterations": 30, "sh_degree": 1, "exposure": "off", **options})
+def settings_of(**options: Any) -> TrainSettings:
+    return TrainSettings(**{"iterations": 30, "sh_degree": 1, "exposure": "off", **options})
+
+
+def train(folder: Path, scene: Scene, monitor: Monitor | None = None, **options: Any) -> tuple[RunArchive, list[str]]:
+    settings = settings_of(**options)
     manifest = Manifest(SceneReference.of(scene), rasterizer="cpu", **settings.for_manifest())
     said = Said()
     with RunArchive.create(folder, manifest) as archive:
-        Trainer(PreparedRun.of(scene, settings, archive, placed(CpuRasterizer())), monitor=said).run()
+        Trainer(PreparedRun.of(scene, settings, archive, placed(CpuRasterizer())), monitor=monitor or said).run()
     return RunArchive.open(folder), said.lines
 
 
@@ -111,6 +116,17 @@ def test_corrections_of_poses_are_in_the_users_units(tmp_path: Path) -> None:
     assert shifts[0].norm() > 0.0
     largest = float(shifts[0].abs().max())
     torch.testing.assert_close(shifts[1] / 64.0, shifts[0], rtol=0.0, atol=0.05 * largest)  # 0.002 * largest seen
+
+
+def test_a_run_in_other_units_resumes_to_the_same_bits(tmp_path: Path) -> None:
+    scene = load_scene(write_ring(tmp_path / "scene", 64.0), eval=True, progress=False)
+    options = {"refine_poses": True, "levels": 2, "iterations": 24}
+    whole, _ = train(tmp_path / "whole", scene, **options)
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "stopped", scene, StopAt(0, 9), **options)
+    resumed = resume(tmp_path / "stopped", scene, settings_of(**options))
+    assert plys(resumed) == plys(whole)
+    assert resumed.poses(0) == whole.poses(0)
 
 
 @pytest.mark.parametrize("scale", [*SCALES, 0.7, 1.9])
