@@ -293,6 +293,15 @@ def test_removal_leaves_the_weight_of_the_opacities_that_remain(signed: bool) ->
     assert pull(1001) == pytest.approx(before if signed else 5 * before, rel=1e-6)
 
 
+def test_a_residual_under_pressure_keeps_gaussians(tmp_path: Path) -> None:
+    """With four times the default weight of opacities. A mean over those that are left would kill nearly all of them."""
+    density = Densification(MCMC, start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=0.04))
+    settings = TrainSettings(iterations=300, levels=2, sh_degree=0, exposure="off", densification=density)
+    residual = train(tmp_path / "run", ring_scene(), settings).manifest.records[-1]
+    assert residual.start_gaussians == 600
+    assert residual.num_gaussians > 30  # 81 seen, 7 before
+
+
 def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:
     torch.manual_seed(0)
     model = trained_once(200)
