@@ -294,7 +294,7 @@ def test_removal_leaves_the_weight_of_the_opacities_that_remain(signed: bool) ->
 
 
 def test_a_residual_under_pressure_keeps_gaussians(tmp_path: Path) -> None:
-    """With four times the default weight of opacities. A mean over those that are left would kill nearly all of them."""
+    """A mean over those that are left would kill nearly all, with four times the default weight."""
     density = Densification(MCMC, start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=0.04))
     settings = TrainSettings(iterations=300, levels=2, sh_degree=0, exposure="off", densification=density)
     residual = train(tmp_path / "run", ring_scene(), settings).manifest.records[-1]
