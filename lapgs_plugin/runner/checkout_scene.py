@@ -15,11 +15,11 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.checkouts.source import OTHERWISE, START
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import SceneError, UserInputError, counted
+from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
 from lapgs_plugin.runner.object_values import with_values
 from lapgs_plugin.scenes.colmap import why_no_points
-from lapgs_plugin.scenes.scene import LEAST_PLACES, count_places, some_of
+from lapgs_plugin.scenes.scene import require_places, some_of
 
 logger = logging.getLogger(__name__)
 
@@ -79,14 +79,10 @@ class CheckoutScene:
         """Say if the rasterizer would draw few of the points that training starts from, or none.
 
         Raises:
-            UserInputError: they are at too few places to have sizes.
+            SceneError: they are at too few places to have sizes.
         """
         points = torch.as_tensor(np.asarray(self.points.points)).float()  # (n, 3)
-        if (places := count_places(points)) < LEAST_PLACES:
-            raise UserInputError(
-                f"the scene has {counted(len(points), 'sparse point')} at {counted(places, 'place')}, expected points "
-                f"at {LEAST_PLACES} or more; reconstruct or export them again"
-            )
+        require_places(points, "the scene has")
         seen = [_depths_in_view(camera, some_of(points)) for camera in self.train]
         near, ahead = sum(int((each <= NEAR_DEPTH).sum()) for each in seen), sum(map(len, seen))
         if 2 * near > ahead:

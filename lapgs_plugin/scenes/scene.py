@@ -180,11 +180,7 @@ def load_scene(
     path = Path(path)
     masks = resolve_masks(path, masks)
     source = _checked_source(path, images, eval)
-    if (places := count_places(torch.from_numpy(source.points))) < LEAST_PLACES:
-        raise SceneError(
-            f"{path}: {counted(len(source.points), 'sparse point')} at {counted(places, 'place')}, expected points at "
-            f"{LEAST_PLACES} or more; reconstruct or export them again"
-        )
+    require_places(torch.from_numpy(source.points), f"{path}:")
     for warning in source.warnings:
         logger.warning(warning)
     frames = [*source.train, *source.test]
@@ -199,7 +195,8 @@ def load_scene(
             "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
             *(resolution, len(short), len(frames), max(short)),
         )
-    _warn_if_rounded(path, source.train, max(camera.fx for camera in cameras), source.points)
+    depth = _median_depth(source.points, source.train)
+    _warn_if_rounded(path, source.train, max(camera.fx for camera in cameras), depth)
     behind = background if source.kind == "transforms" else None  # 3DGS ignores alpha of COLMAP scenes
 
     def load(posed: tuple[Frame, Camera]) -> View:
@@ -237,7 +234,7 @@ def load_scene(
         colors=torch.from_numpy(source.colors).float().clamp(0.0, 1.0),
         extent=_extent(path, source.train),
         background=background,
-        unit=_unit(source.points, source.train),
+        unit=unit_of_depth(depth) if depth else 1.0,
     )
 
 
@@ -400,18 +397,16 @@ def _extent(path: Path, train: Sequence[Frame]) -> float:
     return extent
 
 
-def _unit(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
-    """Return `Scene.unit`; 1 if no camera sees a point."""
-    return unit_of_depth(depth) if (depth := _median_depth(points, train)) else 1.0
-
-
-def _warn_if_rounded(path: Path, train: Sequence[Frame], focal: float, points: NDArray[np.float64]) -> None:
+def _warn_if_rounded(path: Path, train: Sequence[Frame], focal: float, depth: float) -> None:
     """Warn if float32 rounds positions to more than a part of a pixel: the model is far from the origin.
 
     Args:
+        path: of the scene.
+        train: training frames.
         focal: the longest focal length of the views, in pixels.
+        depth: as `_median_depth`.
     """
-    depth = _median_depth(points, train) or _extent(path, train)  # made-up points may be elsewhere
+    depth = depth or _extent(path, train)  # made-up points may be elsewhere
     away = float(torch.stack([frame.camera.position.norm() for frame in train]).median())
     rounded = float(np.spacing(np.float32(away))) * focal / depth  # pixels
     if rounded > ROUNDED:
@@ -437,10 +432,22 @@ def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:
     return depths[(depths > 0) & inside]
 
 
-def count_places(points: Tensor) -> int:
-    """Return at how many places points (n, 3) are, counted among some of them if these are at enough places."""
+def require_places(points: Tensor, whose: str) -> None:
+    """Check that points (n, 3) are at enough places to have sizes. They are counted among some, if that is enough.
+
+    Args:
+        points: of a scene.
+        whose: begins the message, such as "the scene has".
+
+    Raises:
+        SceneError: they are not.
+    """
     places = len(places_of(some_of(points))[0])
-    return places if places >= LEAST_PLACES else len(places_of(points)[0])
+    if places < LEAST_PLACES and (places := len(places_of(points)[0])) < LEAST_PLACES:
+        raise SceneError(
+            f"{whose} {counted(len(points), 'sparse point')} at {counted(places, 'place')}, expected points at "
+            f"{LEAST_PLACES} or more; reconstruct or export them again"
+        )
 
 
 def some_of(points: Tensor) -> Tensor:
