@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import lapgs_plugin as lapgs
-from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
+from lapgs_plugin.reference_raster import gsplat as gsplat_on_cpu
 from lapgs_plugin.scenes import load_scene
 
 SH_DEGREE = 3

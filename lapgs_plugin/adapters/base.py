@@ -118,7 +118,7 @@ class BackboneAdapter:
 
     @classmethod
     def stand_in_for(cls, checkout: Path, arguments: Sequence[str]) -> str:
-        """Return the variant of `reference_raster.standins` for a checkout's rasterizer.
+        """Return the variant of `family` for a checkout's rasterizer.
 
         Args:
             checkout: root of the checkout.

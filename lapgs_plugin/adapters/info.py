@@ -25,7 +25,7 @@ class BackboneInfo:
         name: for `--backbone` and the manifest.
         title: as its authors write it.
         rasterizer: the CUDA module it renders with.
-        stand_in: the variant of `reference_raster.standins` that takes the module's place on a CPU, where runs are
+        stand_in: the variant of `family` that takes the module's place on a CPU, where runs are
             rendered without a checkout, and where it fits the checkout's calls; empty is chosen by the calls alone.
         densify_thresholds: its options that are thresholds on screen-space gradients for densification; empty finds
             them by their names.

@@ -24,7 +24,7 @@ from torch.overrides import TorchFunctionMode
 
 from lapgs_plugin.checkouts.absent_modules import absent_modules
 from lapgs_plugin.checkouts.attachment import replaced
-from lapgs_plugin.reference_raster.standins import VARIANTS, install
+from lapgs_plugin.family import VARIANTS, install
 
 __all__ = ["cuda_on_cpu"]
 
@@ -37,8 +37,8 @@ def cuda_on_cpu(variant: str | None, *, neighbours: bool = False) -> Iterator[No
     those that are started inside.
 
     Args:
-        variant: stand-in for the checkout's rasterizer, a key of `standins.VARIANTS`; None for a script without one.
-        neighbours: as of `standins.install`.
+        variant: stand-in for the checkout's rasterizer, a key of `family.VARIANTS`; None for a script without one.
+        neighbours: as of `family.install`.
 
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.

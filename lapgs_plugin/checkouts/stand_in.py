@@ -9,14 +9,14 @@ from pathlib import Path
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.source import CheckoutSource, readable_source
 from lapgs_plugin.errors import MissingExtraError
-from lapgs_plugin.reference_raster.standins.variants import VARIANTS, rasterizer_module
+from lapgs_plugin.family.variants import VARIANTS, rasterizer_module
 
 OPTIONAL_INPUTS = {"dc", "raster_settings"}
 """Inputs that checkouts pass in one of several calls, and that of the constructor."""
 
 
 def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
-    """Return the variant of `standins.VARIANTS` that fits the imports and calls of a checkout's training script.
+    """Return the variant of `family.VARIANTS` that fits the imports and calls of a checkout's training script.
 
     Args:
         checkout: root of the checkout.

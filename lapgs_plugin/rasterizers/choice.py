@@ -148,7 +148,7 @@ def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, An
 def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
     """Return an extension, or its stand-in on a CPU."""
     if device == "cpu" or not torch.cuda.is_available():
-        from lapgs_plugin.reference_raster.standins import stand_ins
+        from lapgs_plugin.family import stand_ins
 
         modules = stand_ins(stand_in) if stand_in else {}
         if name not in modules:

@@ -12,7 +12,7 @@ from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.checkouts.stand_in import fitting_stand_in
 from lapgs_plugin.cli.doctor_checkout import describe
 from lapgs_plugin.errors import MissingExtraError
-from lapgs_plugin.reference_raster.standins import FORKS, VARIANTS
+from lapgs_plugin.family import FORKS, VARIANTS
 from tests.contract.stub_runs import STUBS, stand_in_is_refused
 
 

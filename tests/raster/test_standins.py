@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.family import BACKBONES, VARIANTS, install, stand_ins
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer, project
-from lapgs_plugin.reference_raster.standins import BACKBONES, VARIANTS, install, stand_ins
 from tests.raster.scenes import COLORED, Case, make_camera, random_case, to_world
 from tests.raster.standin_cases import covariances
 

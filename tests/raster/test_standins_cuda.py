@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.reference_raster.standins import BACKBONES, VARIANTS, stand_ins
+from lapgs_plugin.family import BACKBONES, VARIANTS, stand_ins
 from tests.raster.standin_cases import CASES, outputs, ssim_outputs
 
 FIXTURES = Path(__file__).parent / "fixtures"

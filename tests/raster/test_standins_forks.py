@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.family import stand_ins
+from lapgs_plugin.family.forks import compute_relocation
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.reference_raster.oracle import project
-from lapgs_plugin.reference_raster.standins import stand_ins
-from lapgs_plugin.reference_raster.standins.forks import compute_relocation
 from tests.raster.scenes import Case
 from tests.raster.test_standins import activated, call, case_of, module_of, relative, settings_of
 

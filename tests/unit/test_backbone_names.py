@@ -12,7 +12,7 @@ from lapgs_plugin.adapters.registry import OWN
 from tests.package_strings import PACKAGES, ROOT
 
 EXCEPTIONS = {
-    "lapgs_plugin/reference_raster/standins": "the backbones' CUDA modules on a CPU, one table of settings for all",
+    "lapgs_plugin/family": "the backbones' CUDA modules on a CPU, one table of settings for all",
 }
 """Folders whose files may name any backbone, and why."""
 

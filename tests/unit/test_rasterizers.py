@@ -19,6 +19,7 @@ from lapgs_bench.kernels.gsplat_on_cpu import _cuda_parts_replaced
 from lapgs_plugin.adapters.fastgs import Adapter as FastgsAdapter
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.cases import Case, pixel_weights, random_case
+from lapgs_plugin.family import install, stand_ins
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, render_transmittance
 from lapgs_plugin.rasterizers import choice
@@ -28,7 +29,6 @@ from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
-from lapgs_plugin.reference_raster.standins import install, stand_ins
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 
 FASTGS, GRAPHDECO = "diff_gaussian_rasterization_fastgs", "diff_gaussian_rasterization"

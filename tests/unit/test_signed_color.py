@@ -19,6 +19,7 @@ from torch import Tensor
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.evaluation.cases import Case, make_camera, make_field, pixel_weights, random_case
 from lapgs_plugin.evaluation.conformance import Subject, check, check_case, conformance_cases
+from lapgs_plugin.family import BACKBONES, VARIANTS, install
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
@@ -37,7 +38,6 @@ from lapgs_plugin.rasterizers.signed_color import (
 )
 from lapgs_plugin.reference_raster import OracleRasterizer
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
-from lapgs_plugin.reference_raster.standins import BACKBONES, VARIANTS, install
 from tests.raster.scenes import gradients
 
 ORACLE = OracleRasterizer()

@@ -104,8 +104,8 @@ def test_supervisions_by_name() -> None:
 
 def test_a_gpu_takes_the_fused_ssim_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Check only which function is called; the stand-in of the package computes SSIM on the CPU."""
+    from lapgs_plugin.family.fused_ssim import fused_ssim
     from lapgs_plugin.ops import photometric_loss as chosen
-    from lapgs_plugin.reference_raster.standins.fused_ssim import fused_ssim
 
     prediction = torch.rand(3, 20, 30, requires_grad=True)
     target = torch.rand(3, 20, 30)

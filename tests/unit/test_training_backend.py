@@ -25,7 +25,7 @@ from lapgs_plugin.ops.adam import GpuFieldAdam
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat_adapter
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.reference_raster.standins import gsplat as gsplat_on_cpu
+from lapgs_plugin.reference_raster import gsplat as gsplat_on_cpu
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.scenes.scene import Scene

@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
-from lapgs_plugin.reference_raster.standins import gsplat as on_cpu
+from lapgs_plugin.reference_raster import gsplat as on_cpu
 from tests.unit.test_rasterizers import WithoutCuda, faint
 
 

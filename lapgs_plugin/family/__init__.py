@@ -22,9 +22,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.family import fused_ssim
+from lapgs_plugin.family.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, mean_squared_distance
-from lapgs_plugin.reference_raster.standins import fused_ssim
-from lapgs_plugin.reference_raster.standins.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
 
 __all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins"]
 

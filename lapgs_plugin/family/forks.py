@@ -17,12 +17,13 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
+from lapgs_plugin.family.call import Inputs, Options, Output
+from lapgs_plugin.family.cpu import depths_of, rasterize
+from lapgs_plugin.reference_raster.blending import Blending
+from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
 from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
-from lapgs_plugin.reference_raster.standins.binding import Rasterizer, WholeSh, gather
-from lapgs_plugin.reference_raster.standins.blending import Blending
-from lapgs_plugin.reference_raster.standins.covariance import covariances_of, matrices
-from lapgs_plugin.reference_raster.standins.engine import Inputs, Options, Output, depths_of, rasterize
 
 logger = logging.getLogger(__name__)
 

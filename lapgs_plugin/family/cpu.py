@@ -1,4 +1,4 @@
-"""Render with `pipeline` from the arguments of the CUDA bindings: the differentiable call of all stand-ins.
+"""Render on the CPU from the arguments of the CUDA bindings, differentiably.
 
 As in the CUDA code, a call without Gaussians gives a black image with any background, the gradient by `means2D` is in
 units of half the image's sides, and the gradient by the scales lacks the factor `scale_modifier`.
@@ -7,8 +7,8 @@ units of half the image's sides, and the gradient by the scales lacks the factor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,101 +16,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.family.call import Inputs, Options, Output, Settings
 from lapgs_plugin.reference_raster import pipeline
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION, SIGNED_COLOR_BIT
-from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
-from lapgs_plugin.reference_raster.standins.blending import Blending
-from lapgs_plugin.reference_raster.standins.contributions import Contributions, contributions
-from lapgs_plugin.reference_raster.standins.covariance import (
+from lapgs_plugin.reference_raster.blending import Blending
+from lapgs_plugin.reference_raster.contributions import Contributions, contributions
+from lapgs_plugin.reference_raster.covariance import (
     antialiasing_factors,
     covariance_gradients,
     covariances_of,
     principal_axes,
 )
-from lapgs_plugin.reference_raster.standins.snug_tiles import snug_tiles
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION, SIGNED_COLOR_BIT
+from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
+from lapgs_plugin.reference_raster.snug_tiles import snug_tiles
 
 FOCAL_TOLERANCE = 1e-3
 """Relative tolerance between the focal lengths in `projmatrix` and those of the fields of view."""
-
-
-class Settings(Protocol):
-    """Declare the fields that all `GaussianRasterizationSettings` share, named as in the CUDA bindings."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-
-
-class Inputs(NamedTuple):
-    """Hold the tensors of a call; n Gaussians, float32, None for arguments that are not given.
-
-    Attributes:
-        means: (n, 3).
-        means2d: (n, 3), or (n, 4) for sums of absolute values in the last two columns; only its gradient is used.
-        opacities: (n, 1).
-        sh: (n, k, 3), or None if there are colours.
-        colors: (n, 3), or None.
-        scales, quats: (n, 3) and (n, 4), or None if there are covariances.
-        covariances: (n, 6), or None.
-    """
-
-    means: Tensor
-    means2d: Tensor
-    opacities: Tensor
-    sh: Tensor | None
-    colors: Tensor | None
-    scales: Tensor | None
-    quats: Tensor | None
-    covariances: Tensor | None
-
-
-@dataclass(frozen=True)
-class Options:
-    """Hold the options that only some rasterizers have.
-
-    Attributes:
-        mult: FastGS's compact box, or None for three-sigma squares.
-        antialiasing: dim Gaussians that are smaller than a pixel.
-        inverse_depth: also blend 1 / depth.
-        pixel_weights: (height * width,) float32 to sum up for each Gaussian, or None.
-        blending: return how each pixel is blended.
-    """
-
-    mult: float | None = None
-    antialiasing: bool = False
-    inverse_depth: bool = False
-    pixel_weights: Tensor | None = None
-    blending: bool = False
-
-
-@dataclass(frozen=True)
-class Output:
-    """Hold the results of a call.
-
-    Attributes:
-        image: (3, height, width).
-        radii: (n,) int32, 0 where culled.
-        inverse_depths: (1, height, width), or None if not asked for.
-        centres: (n, 2) pixels, 0 where culled.
-        depths: (n,) camera-space z, 0 where culled.
-        contributions: None without pixel weights.
-        blending: None if not asked for.
-    """
-
-    image: Tensor
-    radii: Tensor
-    inverse_depths: Tensor | None
-    centres: Tensor
-    depths: Tensor
-    contributions: Contributions | None
-    blending: Blending | None = None
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:

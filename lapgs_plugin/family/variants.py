@@ -25,9 +25,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.reference_raster.standins import forks
-from lapgs_plugin.reference_raster.standins.binding import DcApart, Rasterizer, SparseGaussianAdam, WholeSh
-from lapgs_plugin.reference_raster.standins.engine import Options, Output
+from lapgs_plugin.family import forks
+from lapgs_plugin.family.binding import DcApart, Rasterizer, SparseGaussianAdam, WholeSh
+from lapgs_plugin.family.call import Options, Output
 
 _VIEW = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",

@@ -8,14 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.reference_raster.standins.engine import Inputs, Settings, mark_visible, rasterize
+from lapgs_plugin.family.call import Inputs, Settings
+from lapgs_plugin.family.cpu import mark_visible, rasterize
 
 if TYPE_CHECKING:
-    from lapgs_plugin.reference_raster.standins.variants import Variant
+    from lapgs_plugin.family.variants import Variant
 
 
 class Rasterizer(nn.Module):
-    """Render Gaussians with the settings of one view; see `engine.Inputs` for shapes and `Variant.outputs`."""
+    """Render Gaussians with the settings of one view; see `call.Inputs` for shapes and `Variant.outputs`."""
 
     variant: ClassVar[Variant]
 
