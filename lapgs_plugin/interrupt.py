@@ -3,10 +3,10 @@
 `install` is called once, at the start of the process, before anything heavy is imported; so this module imports little.
 From then on the effect of a signal depends on the main thread:
 
-- Outside a command (imports, parsing, exit) there is nothing to clean up: the process prints its line and ends.
-- In a command, `Interrupted` is raised, so that temporary files and child processes are cleaned up. It is not raised
-  during an import, which compiled modules do not survive: a short import is waited for, a long one ends the process.
+- In a command, `Interrupted` is raised, so that temporary files and child processes are cleaned up.
 - In training, `stop_request` turns the first signal into a request to stop after the current iteration.
+- Elsewhere the process ends immediately: outside a command there is nothing to clean up, and compiled modules do not
+  survive an exception during an import.
 
 A second signal ends the process immediately with the exit code of the first.
 """
@@ -30,13 +30,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SAME_PRESS = 0.5
 """Seconds in which another signal counts as the first: wrappers forward a Ctrl-C that the terminal sent to both."""
 
-RETRY = 0.03
-"""Seconds until an interruption is raised that came during an import, or was lost in a callback of C code."""
-
-IMPORT_PATIENCE = 0.3
-"""Seconds to wait for the end of an import before ending without cleanup."""
-
-_SHOW_CURSOR = "\x1b[?25h"  # progress bars hide the cursor
+_SHOW_CURSOR = "\x1b[?25h"
+"""Terminal code that undoes what progress bars do."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -44,20 +39,20 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopRequest:
-    """A flag that is set by a request to stop."""
+    """Hold whether the user asked to stop."""
 
     requested = False
 
 
 class _Process:
-    """The state of signals in this process.
+    """Hold the state of signals in this process.
 
     Attributes:
         number: the first signal; None before.
-        since: when it came.
-        in_command: whether a command runs, which may have something to clean up.
-        raised: whether `Interrupted` was raised in a command or will be.
-        advice: what to do after the command was stopped; the line ends with it.
+        since: monotonic time of that signal in seconds.
+        in_command: whether a command runs.
+        raised: whether `Interrupted` was raised.
+        advice: end of the line, about continuing a stopped command.
         said: whether the line was printed.
     """
 
@@ -80,11 +75,8 @@ def install() -> None:
             signal.signal(number, _handle)
         # Registered first, so run last: a finalizing interpreter would restore the default handlers.
         atexit.register(signal.signal, number, signal.SIG_IGN)
-    if sys.platform != "win32":
-        signal.signal(signal.SIGALRM, _stop)
-        sys.unraisablehook = _unraisable
-        for name in ("create_module", "exec_module"):
-            setattr(ExtensionFileLoader, name, _holding_signals(getattr(ExtensionFileLoader, name)))
+    sys.unraisablehook = _leave_if_lost
+    setattr(ExtensionFileLoader, "exec_module", _keeping_handlers(ExtensionFileLoader.exec_module))  # noqa: B010
 
 
 @contextmanager
@@ -101,19 +93,17 @@ def command() -> Iterator[None]:
         if not stopped or getattr(error, "exit_code", None) == 130:  # an error with a message of its own
             raise
     else:
-        if not _process.raised:  # otherwise the command swallowed it, or ended before it was raised
+        if not _process.raised:  # otherwise the command swallowed it
             return
     finally:
         _process.in_command = False
-        if _process.raised:
-            _retry(0.0)
     _print_line()
     sys.exit(exit_code(130))
 
 
-def advise(what: str) -> None:
-    """Add what to do next to the line of this command, should a signal stop it."""
-    _process.advice = f"; {what}"
+def advise(advice: str) -> None:
+    """Add advice to the line of this command, should a signal stop it."""
+    _process.advice = f"; {advice}"
 
 
 def exit_code(code: int) -> int:
@@ -151,7 +141,7 @@ def stop_request() -> Iterator[StopRequest]:
 
 
 def _is_first(number: int) -> bool:
-    """Whether no signal came before this one, which is remembered then."""
+    """Return whether no signal came before this one, and remember the first."""
     if _process.number is not None:
         return False
     _process.number, _process.since = number, time.monotonic()
@@ -159,28 +149,14 @@ def _is_first(number: int) -> bool:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    if _is_first(number):
-        _stop(number, frame)
-    elif time.monotonic() - _process.since >= SAME_PRESS:
+    if not _is_first(number):
+        if time.monotonic() - _process.since >= SAME_PRESS:
+            _leave()
+    elif not _process.in_command or _importing(frame):
         _leave()
-
-
-def _stop(number: int, frame: FrameType | None) -> None:
-    """End the process or its command, or retry after an import."""
-    importing = _importing(frame)
-    late = importing and (sys.platform == "win32" or time.monotonic() - _process.since > IMPORT_PATIENCE)
-    if late or not _process.in_command:
-        _leave()
-    _process.raised = True
-    if not importing:
+    else:
+        _process.raised = True
         raise Interrupted
-    _retry(RETRY)
-
-
-def _retry(seconds: float) -> None:
-    """Call `_stop` after some seconds; 0 for never."""
-    if sys.platform != "win32":
-        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _importing(frame: FrameType | None) -> bool:
@@ -208,30 +184,21 @@ def _leave() -> NoReturn:
     os._exit(exit_code(130))
 
 
-def _unraisable(unraisable: Any) -> None:
-    """Raise an interruption again that was lost in a callback of C code or a finalizer; report others as usual."""
-    if issubclass(unraisable.exc_type, Interrupted) and _process.in_command:
-        _retry(RETRY)
-    else:
-        sys.__unraisablehook__(unraisable)
+def _leave_if_lost(unraisable: Any) -> None:
+    """End the process if a callback of C code or a finalizer lost an interruption; report other errors as usual."""
+    if issubclass(unraisable.exc_type, Interrupted):
+        _leave()
+    sys.__unraisablehook__(unraisable)
 
 
-def _holding_signals(load: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Block signals while a compiled module is loaded, and restore our handlers afterwards.
+def _keeping_handlers(load: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
+    """Restore our handlers after a compiled module is loaded: pycolmap's of SIGTERM prints a C++ stack."""
 
-    Modules such as OpenImageIO call Python from C++ while they are loaded, where raising aborts the process. Threads
-    that they start leave signals to the main thread. pycolmap installs a SIGTERM handler that prints a C++ stack.
-    """
+    def load_and_restore(self: Any, module: Any) -> None:
+        load(self, module)
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if (handler := signal.getsignal(number)) is not None:
+                    signal.signal(number, handler)
 
-    def held(self: Any, argument: Any) -> Any:
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
-            return load(self, argument)
-        finally:
-            if threading.current_thread() is threading.main_thread():
-                for number in SIGNALS:
-                    if (handler := signal.getsignal(number)) is not None:
-                        signal.signal(number, handler)
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-    return held
+    return load_and_restore
