@@ -31,9 +31,9 @@ def printable_lines(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return text as one printable line without the middle of very long text."""
+    """Return text as one printable line. Very long text loses its middle: the file and the advice are at its ends."""
     line = printable(text)
-    if len(line) > LONGEST_LINE:  # it quotes a long value; the file and the advice are at its ends
+    if len(line) > LONGEST_LINE:
         line = f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
     return line
 
@@ -101,6 +101,10 @@ class RunFolderError(UserInputError):
     """A run folder cannot be read, written or resumed."""
 
 
+class PatchError(UserInputError):
+    """A checkout's sources cannot be patched or reverted as asked."""
+
+
 class TrainingDivergedError(LapgsError):
     """Training produced NaN or inf; finished levels are kept."""
 
@@ -121,7 +125,7 @@ class MissingExtraError(LapgsError, ImportError):
 
 @contextmanager
 def errors_about(file: object) -> Iterator[None]:
-    """Begin the messages of a block's errors with the file whose values it uses: the user did not type them.
+    """Begin the messages of errors in a block with a file, for values that the user did not type.
 
     Raises:
         UserInputError: the block raised it, or a kind of it.
@@ -132,13 +136,13 @@ def errors_about(file: object) -> Iterator[None]:
         raise type(error)(f"{file}: {error}") from error
 
 
-def require_extra(module: str, extra: str, what: str, otherwise: str = "") -> None:
+def require_extra(module: str, extra: str, subject: str, otherwise: str = "") -> None:
     """Check that the package of an extra is installed, without importing it.
 
     Args:
         module: of the package.
         extra: of lapgs_plugin that brings it.
-        what: file, command or option that needs it, the subject of the message.
+        subject: of the message: the file, command or option that needs it.
         otherwise: what to do without it.
 
     Raises:
@@ -146,8 +150,4 @@ def require_extra(module: str, extra: str, what: str, otherwise: str = "") -> No
     """
     if find_spec(module) is None:
         package, instead = module.replace("_", "-"), f"; or {otherwise}" if otherwise else ""
-        raise MissingExtraError(f"{what} needs {package}: pip install 'lapgs_plugin[{extra}]'{instead}")
-
-
-class PatchError(UserInputError):
-    """A checkout's sources cannot be patched or reverted as asked."""
+        raise MissingExtraError(f"{subject} needs {package}: pip install 'lapgs_plugin[{extra}]'{instead}")

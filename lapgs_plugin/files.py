@@ -29,8 +29,11 @@ BARE_RECORD = "lapgs_record.json"
 PREVIEW = "preview.jpg"
 """Picture of a run that the viewer shows first; named here because it is read before torch is imported."""
 
-LOCK, LOCK_POLL_SECONDS = ".lock", 0.05
-"""File that `FolderLock` locks; seconds between two attempts to lock something."""
+LOCK = ".lock"
+"""File that `FolderLock` locks."""
+
+LOCK_POLL_SECONDS = 0.05
+"""Time between two attempts to lock something."""
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of the text in place of a file that Git LFS keeps elsewhere."""
@@ -40,7 +43,7 @@ TEMPORARY_PATTERN = ".*.tmp"
 
 
 def as_pip_argument(folder: Path) -> str:
-    """Return a folder as `pip install` takes it in a shell: a name without a slash would be a package to download.
+    """Return a folder as an argument of `pip install` in a shell. A name without a slash is a package to download.
 
     >>> as_pip_argument(Path("rasterizer")), as_pip_argument(Path("/code/my rasterizer"))
     ('./rasterizer', "'/code/my rasterizer'")
@@ -85,7 +88,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def whole_file(path: Path, what: str) -> Iterator[Path]:
+def whole_file(path: Path, kind: str) -> Iterator[Path]:
     """Yield a name beside `path` to write a file under, and rename the file when the block ends without an error.
 
     For programs that write files by name. Missing folders are made. Unlike `atomic_write` it may lose the file in a
@@ -93,7 +96,7 @@ def whole_file(path: Path, what: str) -> Iterator[Path]:
 
     Args:
         path: of the file.
-        what: it is, such as "image", for the message.
+        kind: of the file, such as "image", for the message.
 
     Raises:
         LapgsError: the block raised an OSError.
@@ -107,7 +110,7 @@ def whole_file(path: Path, what: str) -> Iterator[Path]:
     except OSError as error:
         reason = joined(error)[-300:]
         raise LapgsError(
-            f"{path}: the {what} cannot be written ({reason}); check free space and permissions"
+            f"{path}: the {kind} cannot be written ({reason}); check free space and permissions"
         ) from error
     finally:
         with suppress(OSError):
@@ -170,7 +173,7 @@ def is_folder(path: Path) -> bool:
 
 
 def require_own(path: Path) -> None:
-    """Check that a path which is to be written is free, or a file or folder and no link.
+    """Check that a path to write to is missing, a file or a folder, so that nothing is written through a link.
 
     Raises:
         RunFolderError: it is a link, a pipe, a socket or a device, or its folder cannot be read.
@@ -189,7 +192,7 @@ def require_own(path: Path) -> None:
 
 
 def require_own_entries(folder: Path, names: Iterable[str]) -> None:
-    """Check some entries of a folder, and all that these hold, with `require_own`. The folder may be a link itself."""
+    """Check entries of a folder, and everything in them, with `require_own`. The folder itself may be a link."""
     for name in names:
         require_own(folder / name)
         for parent, folders, files in os.walk(folder / name):
@@ -198,7 +201,7 @@ def require_own_entries(folder: Path, names: Iterable[str]) -> None:
 
 
 def refuse_lfs_pointer(file: Path, kind: type[LapgsError]) -> None:
-    """Raise an error of this kind if a file is the short text that Git leaves in its place where Git LFS is missing."""
+    """Raise an error of this kind if a file is the short text that Git leaves in its place without Git LFS."""
     with file.open("rb") as stream:
         if stream.read(len(LFS_POINTER)) == LFS_POINTER:
             raise kind(f"{file}: a pointer of Git LFS, not the file itself; fetch it with `git lfs pull`")
@@ -213,8 +216,8 @@ def require_manifest(folder: Path) -> None:
     with one_line_errors(folder, "read"):
         is_run = (folder / MANIFEST).is_file()
     if not is_run:
-        what = f"has no {MANIFEST}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
-        raise RunFolderError(f"{folder} {what}, so it is not a run; expected a folder written by `lapgs train -o`")
+        state = f"has no {MANIFEST}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+        raise RunFolderError(f"{folder} {state}, so it is not a run; expected a folder written by `lapgs train -o`")
 
 
 def lock(descriptor: int, patience: float = 0.0) -> bool | None:

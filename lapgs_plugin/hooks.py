@@ -153,7 +153,7 @@ class SupervisionLoss(StageHook):
 
     @property
     def compares_images(self) -> bool:
-        """Whether the composed image is compared with the target."""
+        """Whether the supervision compares the composed image with the target."""
         return type(self._supervision) is Reconstructed
 
     def loss(self, context: StageContext, image: Tensor) -> Tensor:
@@ -201,7 +201,7 @@ class HookDispatcher:
         return cls((*stock, *entry_point_hooks(registered), *user_hooks))
 
     def is_plain(self, stage: Stage) -> bool:
-        """Whether the loss of a stage is the photometric loss of the composed image, and no user's hook takes part."""
+        """Return whether the loss of a stage is the photometric loss of the composed image, without any user's hook."""
         supervised = [hook for hook in self._hooks if type(hook) is SupervisionLoss]
         others = [hook for hook in self._hooks if type(hook) not in (SupervisionLoss, Composition)]
         compares_images = all(hook.compares_images for hook in supervised) or not stage.signed
@@ -296,9 +296,9 @@ def entry_point_hooks(registered: str = ALL) -> tuple[StageHook, ...]:
 
 
 def hooks_line(registered: str = ALL) -> str | None:
-    """Say which hooks of installed packages take part in a run, as of `entry_point_hooks`; None without any."""
-    found = [f"{entry.name} ({entry.value})" for entry in chosen_entries("--hooks", HOOKS, registered)]
-    return f"hooks of installed packages: {', '.join(found)}" if found else None
+    """Return a line that lists the hooks of installed packages, chosen as in `entry_point_hooks`; None without any."""
+    chosen = [f"{entry.name} ({entry.value})" for entry in chosen_entries("--hooks", HOOKS, registered)]
+    return f"hooks of installed packages: {', '.join(chosen)}" if chosen else None
 
 
 HOOK_NAMES = tuple(name for name in vars(StageHook) if not name.startswith("_"))

@@ -60,19 +60,20 @@ class Limit:
 
 
 PHOTO_PIXELS = Limit("LAPGS_MAX_PHOTO_PIXELS", 250_000_000, "pixels")
-"""Of an image file before resizing; phone cameras have up to 200 million."""
+"""Largest image file, before resizing. Phone cameras have up to 200 million pixels."""
 
 PHOTO_SIDE = Limit("LAPGS_MAX_PHOTO_SIDE", 65_536, "pixels a side")
-"""Of an image file, whose rows are read whole."""
+"""Longest side of an image file, whose rows are read whole."""
 
 VIEW_PIXELS = Limit("LAPGS_MAX_VIEW_PIXELS", 128_000_000, "pixels")
-"""Of an image that is trained on or rendered, which takes 12 bytes per pixel as float32."""
+"""Largest image to train on or to render. It takes 12 bytes a pixel as float32."""
 
 FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
-"""Of a camera path; an hour of video at 24 frames a second has 86,400."""
+"""Longest camera path. An hour of video at 24 frames a second has 86,400 frames."""
 
 LONGEST_NAME = 255
 """Longest file name in bytes on common file systems."""
+
 LONGEST_STEM = 230
 """Longest name in bytes that leaves room for suffixes, such as those of attempts, logs and temporary files."""
 

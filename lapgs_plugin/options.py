@@ -14,8 +14,11 @@ from lapgs_plugin.errors import UserInputError
 if TYPE_CHECKING:
     from lapgs_plugin.registry import Registry
 
-KEY, CHOSEN = "option", "chosen"
-"""Keys of a field's metadata: its `Option`; the registry and the field that says which object of it is chosen."""
+KEY = "option"
+"""Key of a field's metadata for its `Option`."""
+
+CHOSEN = "chosen"
+"""Key of a field's metadata for a registry, and for the name of the field that chooses an object of it."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +81,10 @@ def option_name(declared: Field[Any]) -> str:
 def option_values(settings: Any) -> Mapping[str, Any]:
     """Return the option values of a settings object, including nested dataclasses, by parameter name."""
     values: dict[str, Any] = {}
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        if (declared := each.metadata.get(KEY)) is not None:
-            values[parameter_name(each.name, declared)] = value
+    for setting in fields(settings):
+        value = getattr(settings, setting.name)
+        if (declared := setting.metadata.get(KEY)) is not None:
+            values[parameter_name(setting.name, declared)] = value
         elif is_dataclass(value):
             values.update(option_values(value))
     return values
@@ -93,11 +96,11 @@ def check_values(settings: Any) -> None:
     Raises:
         UserInputError: a number is out of bounds, or a text is not among the choices.
     """
-    for each in fields(settings):
-        declared, value = each.metadata.get(KEY), getattr(settings, each.name)
+    for setting in fields(settings):
+        declared, value = setting.metadata.get(KEY), getattr(settings, setting.name)
         if declared is None or value is None:
             continue
-        name = option_name(each)
+        name = option_name(setting)
         if declared.choices and value not in declared.choices:
             *others, last = declared.choices
             raise UserInputError(f"{name} {value}: expected {', '.join(others)} or {last}")

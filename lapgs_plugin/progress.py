@@ -22,11 +22,17 @@ from rich.text import Text
 
 from lapgs_plugin.errors import printable_lines
 
-LEAST_SECONDS, MOST_SECONDS, STEP = 10.0, 60.0, 0.05
-"""Outside of a terminal the first line is printed after `LEAST_SECONDS`, then one at every `STEP` of the work and at
-least every `MOST_SECONDS`, but not more often than every `LEAST_SECONDS`."""
+LEAST_SECONDS = 10.0
+"""Shortest time between two lines outside of a terminal, and until the first."""
+
+MOST_SECONDS = 60.0
+"""Longest time between two lines outside of a terminal."""
+
+STEP = 0.05
+"""Share of the work after which the next line is printed, between these times."""
+
 AVERAGED_SECONDS = 3600.0
-"""Time over which the rate of items is averaged. In shorter times it jumps, because items differ."""
+"""Time over which the rate of items is averaged. Over shorter times it jumps, because items differ."""
 
 
 class EscapingConsole(Console):
@@ -47,10 +53,10 @@ class LoggingProgress(Progress):
 
     def __init__(self, *columns: ProgressColumn, console: Console, unit: str, **options: Any) -> None:
         shown = console.is_terminal
-        # The thread with which rich refreshes a bar, and counts in `track`, ends at once where no bar is shown.
+        # Without a bar, rich needs no thread that refreshes it.
         super().__init__(*columns, console=console, disable=not shown, auto_refresh=shown, **options)
         self._unit = unit
-        self._printed: dict[TaskID, tuple[float, float]] = {}  # when, and completed items; before the first line -inf
+        self._printed: dict[TaskID, tuple[float, float]] = {}  # time of the last line and items completed then, or -inf
 
     def add_task(self, *arguments: Any, **options: Any) -> TaskID:
         """Add a task as rich does."""
@@ -124,7 +130,7 @@ class TimeLeftColumn(ProgressColumn):
 
 
 class RateColumn(ProgressColumn):
-    """Show items per second, or seconds for each item if that is below one."""
+    """Show items per second, or seconds per item where the rate is below one."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()

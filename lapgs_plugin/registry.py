@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-
 HOOKS = "lapgs_plugin.hooks"
 """Entry point group whose members are StageHook classes, created without arguments for every run."""
 
-ALL, NONE = "all", "none"
-"""Choices of entry points besides their names."""
+ALL = "all"
+"""Choice of every entry point."""
+
+NONE = "none"
+"""Choice of no entry point."""
 
 
 def chosen_entries(option: str, group: str, chosen: str) -> list[EntryPoint]:
@@ -31,7 +33,7 @@ def chosen_entries(option: str, group: str, chosen: str) -> list[EntryPoint]:
         chosen: "all", "none", or names separated by commas.
 
     Raises:
-        UserInputError: no installed package registers one of such a name.
+        UserInputError: no installed package registers a chosen name.
     """
     from importlib.metadata import entry_points  # takes longer to import than the rest of this package's options
 
@@ -99,10 +101,10 @@ class Registry(Generic[T]):
             raise UserInputError(f"{label} cannot be loaded: {type(error).__name__}: {error}; {advice}") from error
         is_class = isinstance(loaded, type)
         if self._classes and not (is_class and issubclass(loaded, self._kind)):
-            found = loaded.__name__ if is_class else f"a {type(loaded).__name__}"
-            raise UserInputError(f"{label} is {found}, expected a subclass of {self._kind.__name__}; {advice}")
+            received = loaded.__name__ if is_class else f"a {type(loaded).__name__}"
+            raise UserInputError(f"{label} is {received}, expected a subclass of {self._kind.__name__}; {advice}")
         if not self._classes and not isinstance(loaded, self._kind):
-            found = f"the class {loaded.__name__}" if is_class else f"a {type(loaded).__name__}"
-            raise UserInputError(f"{label} is {found}, expected an instance of {self._kind.__name__}; {advice}")
+            received = f"the class {loaded.__name__}" if is_class else f"a {type(loaded).__name__}"
+            raise UserInputError(f"{label} is {received}, expected an instance of {self._kind.__name__}; {advice}")
         result: T = loaded
         return result

@@ -38,7 +38,7 @@ MIB = 2**20
 JSON_MIB = 32
 """Largest JSON file with cameras or a history, in MiB. Other JSON files may have an eighth of that."""
 BYTES_A_VALUE = 16
-"""Least average of the largest file, which limits its number of values: these take memory and time."""
+"""Bytes for each value that a file may hold: a file of at most n bytes may hold n / 16 values."""
 JSON_MIB_VARIABLE = "LAPGS_JSON_MIB"
 """Environment variable that replaces `JSON_MIB`."""
 TEXT_BYTES = MIB
@@ -60,13 +60,13 @@ _LONG_KEY = re.compile(rf"""(?<![A-Za-z0-9_"'-]){_KEY_PART}(?:[ \t]*\.[ \t]*{_KE
 
 
 class Strict(TypedDict):
-    """Type a dictionary of a file: a key for each value, unless it is `NotRequired`."""
+    """Type a dictionary from a file, all of whose keys must be there unless they are `NotRequired`."""
 
     __pydantic_config__ = STRICT  # type: ignore[misc]  # what pydantic documents
 
 
 class StrictWithMore(TypedDict):
-    """Type those values of a dictionary that are used; it may have others."""
+    """Type the used keys of a dictionary from a file, which may have others."""
 
     __pydantic_config__ = _STRICT_WITH_MORE  # type: ignore[misc]  # what pydantic documents
 
@@ -290,13 +290,13 @@ def _require_plain(value: Any, name: str, error: type[UserInputError], advice: s
     layer = [value]
     for _ in range(DEPTH):
         inner: list[Any] = []
-        for each in layer:
-            if isinstance(each, dict):
-                inner.extend(each)
-                inner.extend(each.values())
-            elif isinstance(each, list):
-                inner.extend(each)
-            elif (unusable := _unusable(each, finite)) is not None:
+        for item in layer:
+            if isinstance(item, dict):
+                inner.extend(item)
+                inner.extend(item.values())
+            elif isinstance(item, list):
+                inner.extend(item)
+            elif (unusable := _unusable(item, finite)) is not None:
                 raise error(f"{name} holds the {unusable}; {advice}")
         layer = inner
         if not layer:
