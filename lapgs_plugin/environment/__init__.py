@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = "lapgs_plugin"
+
 TIMEOUT = 60.0
-"""Seconds that an import or another program may take; a first import from a network disk can take tens."""
+"""Longest time of an import or another program. A first import from a network disk can take tens of seconds."""
 
 
 def versions() -> dict[str, str]:
@@ -41,7 +42,7 @@ def installed_version(distribution: str) -> str | None:
 
 
 def is_installed(module: str) -> bool:
-    """Return whether a module can be found; of a dotted name, the outer packages are imported."""
+    """Return whether a module can be found. The packages around a dotted name are imported."""
     try:
         return importlib.util.find_spec(module) is not None
     except (ImportError, ValueError):
@@ -72,19 +73,18 @@ def driver_version() -> str:
 def gsplat_built() -> bool | None:
     """Return whether the installed gsplat includes its compiled CUDA part, None without gsplat. Imports nothing.
 
-    One that gsplat compiled at its first use is elsewhere, and loaded only where nvcc is found
-    (`findings.gsplat_finding`).
+    A part that gsplat compiled at its first use is in another folder, see `findings.gsplat_finding`.
     """
     spec = importlib.util.find_spec("gsplat")
     if spec is None or not spec.submodule_search_locations:
         return None
-    return any(next(Path(place).glob("csrc*.*"), None) for place in spec.submodule_search_locations)
+    return any(next(Path(folder).glob("csrc*.*"), None) for folder in spec.submodule_search_locations)
 
 
 def triton_missing() -> str:
-    """Return what Triton lacks to start kernels on a GPU, as a clause; empty if nothing. Imports and compiles nothing.
+    """Return a clause about the missing requirement of Triton's kernels, "" without one. Imports and compiles nothing.
 
-    Triton has a compiler for kernels with it. What starts them is a small C program for each, which a C compiler makes.
+    Triton starts each kernel by a small C program, for which it needs a C compiler and Python's headers.
     """
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed"

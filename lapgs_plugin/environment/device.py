@@ -17,7 +17,7 @@ def chosen_device(device: str, advice: str = "`lapgs doctor` says why, or use --
         raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")
     if device == "cpu":
         return device
-    import torch  # takes seconds: what is refused on a CPU is refused without it
+    import torch  # here, because it takes seconds
 
     available = torch.cuda.is_available()
     if device == "cuda" and not available:

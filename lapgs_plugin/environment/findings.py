@@ -1,4 +1,4 @@
-"""Judge what is on this machine for `lapgs doctor`."""
+"""Judge the software and hardware of this machine for `lapgs doctor`."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from lapgs_plugin.environment.probes import Probe, run_probe
 from lapgs_plugin.errors import counted, typed_line
 from lapgs_plugin.limits import usable_processors
 
-NOT_REPORTED = ("", "dev")
-"""Extras that are none, or for development."""
+NOT_REPORTED = {"", "dev"}
+"""No extra, and the one for development."""
 
 VARIABLES = (
     "CUDA_VISIBLE_DEVICES",
@@ -44,10 +44,10 @@ VARIABLES = (
 
 @dataclass(frozen=True)
 class Finding:
-    """The state of one thing, such as a package.
+    """Describe the state of one part of the machine, such as a package.
 
     Attributes:
-        name: of the thing.
+        name: of the part.
         status: "ok", "absent" (missing but not needed) or "problem" (needed or broken).
         detail: version, location or reason, one line.
         advice: how to get it, usually a command; empty if there is nothing to do.
@@ -82,17 +82,17 @@ def torch_findings(probe: Probe, driver: str) -> list[Finding]:
         return [Finding("PyTorch", "problem", probe.error, "python -m pip install --force-reinstall torch")]
     facts = probe.facts
     build = f"built for CUDA {facts['cuda']}" if facts["cuda"] else "built without CUDA"
-    found = [Finding("PyTorch", "ok", f"{facts['version']}, {build}")]
+    findings = [Finding("PyTorch", "ok", f"{facts['version']}, {build}")]
     if facts["gpus"]:
         suffix = f", driver {driver}" if driver else ""
-        return [*found, *(Finding("GPU", "ok", gpu + suffix) for gpu in facts["gpus"])]
+        return [*findings, *(Finding("GPU", "ok", gpu + suffix) for gpu in facts["gpus"])]
     if not driver:
-        return [*found, Finding("GPU", "absent", "no NVIDIA driver found")]
+        return [*findings, Finding("GPU", "absent", "no NVIDIA driver found")]
     if facts["cuda"]:
         reason = facts["complaint"] or "PyTorch cannot use it"
-        return [*found, Finding("GPU", "problem", f"driver {driver}, but {reason}", "update the NVIDIA driver")]
+        return [*findings, Finding("GPU", "problem", f"driver {driver}, but {reason}", "update the NVIDIA driver")]
     advice = "install PyTorch for CUDA as pytorch.org/get-started says"
-    return [*found, Finding("GPU", "problem", f"driver {driver}, but PyTorch is built without CUDA", advice)]
+    return [*findings, Finding("GPU", "problem", f"driver {driver}, but PyTorch is built without CUDA", advice)]
 
 
 def compiler_findings(torch_cuda: str | None) -> list[Finding]:
@@ -112,7 +112,7 @@ def compiler_findings(torch_cuda: str | None) -> list[Finding]:
             detail = f"{release[1]} ({nvcc}), but PyTorch is built for {torch_cuda}: extensions will not build"
             toolkit = Finding("CUDA toolkit", "problem", detail, _toolkit_advice(torch_cuda))
     names = ("cl",) if sys.platform == "win32" else (os.environ.get("CXX", ""), "c++", "g++", "clang++")
-    path = next((found for name in names if name and (found := shutil.which(name))), None)
+    path = next((compiler for name in names if name and (compiler := shutil.which(name))), None)
     if path is None:
         return [toolkit, Finding("C++ compiler", "absent", f"none of {', '.join(filter(None, names))} on the path")]
     output = "" if sys.platform == "win32" else run_program([path, "--version"])[0]
@@ -132,16 +132,17 @@ def numba_findings(probe: Probe) -> list[Finding]:
     if probe.error:
         return [Finding("CPU rasterizer", "problem", probe.error, "python -m pip install --force-reinstall numba")]
     facts = probe.facts
-    found = [Finding("CPU rasterizer", "ok", f"Numba {facts['numba']}, {counted(facts['threads'], 'thread')}")]
+    findings = [Finding("CPU rasterizer", "ok", f"Numba {facts['numba']}, {counted(facts['threads'], 'thread')}")]
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        found = [Finding("CPU rasterizer", "problem", "NUMBA_DISABLE_JIT is set", "unset NUMBA_DISABLE_JIT")]
+        findings = [Finding("CPU rasterizer", "problem", "NUMBA_DISABLE_JIT is set", "unset NUMBA_DISABLE_JIT")]
     if facts["cache"] is None:
         advice = "set NUMBA_CACHE_DIR to a folder that can be written"
-        return [*found, Finding("Kernel cache", "problem", "no folder to write to, every start compiles again", advice)]
+        detail = "no folder to write to, every start compiles again"
+        return [*findings, Finding("Kernel cache", "problem", detail, advice)]
     folder = Path(facts["cache"])
     kernels = len(list(folder.glob("*.nbi")))
     state = f"{kernels} compiled kernels" if kernels else "empty; kernels are compiled at first use"
-    return [*found, Finding("Kernel cache", "ok", f"{state} ({folder})")]
+    return [*findings, Finding("Kernel cache", "ok", f"{state} ({folder})")]
 
 
 def package_findings(requirements: Sequence[Requirement], imports: Mapping[str, Probe]) -> list[Finding]:
@@ -151,13 +152,12 @@ def package_findings(requirements: Sequence[Requirement], imports: Mapping[str, 
         requirements: of the packages.
         imports: by distribution, result of the probe "import" for compiled packages.
     """
-    found = [_package_finding(each) for each in requirements]
-    return [_with_import(finding, imports[finding.name]) if finding.name in imports else finding for finding in found]
+    return [_with_import(_package_finding(requirement), imports.get(requirement.name)) for requirement in requirements]
 
 
-def _with_import(package: Finding, probe: Probe) -> Finding:
+def _with_import(package: Finding, probe: Probe | None) -> Finding:
     """Add the error of an installed package's import, which may lack a system library."""
-    if package.status != "ok" or not probe.error:
+    if package.status != "ok" or probe is None or not probe.error:
         return package
     advice = f"python -m pip install --force-reinstall {package.name}"
     return Finding(package.name, "problem", f"{package.detail}, but the import fails: {probe.error}", advice)
@@ -165,14 +165,16 @@ def _with_import(package: Finding, probe: Probe) -> Finding:
 
 def extra_findings(requirements: Mapping[str, Sequence[Requirement]]) -> list[Finding]:
     """Report for every optional extra in the result of `own_requirements` whether all its packages are installed."""
-    found = []
-    for extra in sorted(name for name, members in requirements.items() if members and name not in NOT_REPORTED):
-        members = [_package_finding(each) for each in requirements[extra]]
+    findings = []
+    for extra in sorted(requirements.keys() - NOT_REPORTED):
+        if not requirements[extra]:
+            continue
+        members = [_package_finding(member) for member in requirements[extra]]
         lacking = [member.name for member in members if member.status != "ok"]
         detail = f"lacks {', '.join(lacking)}" if lacking else ", ".join(f"{m.name} {m.detail}" for m in members)
         advice = f"python -m pip install '{PACKAGE}[{extra}]'" if lacking else ""
-        found.append(Finding(f"[{extra}]", "absent" if lacking else "ok", detail, advice))
-    return found
+        findings.append(Finding(f"[{extra}]", "absent" if lacking else "ok", detail, advice))
+    return findings
 
 
 ENTRY_POINT_GROUPS = {
@@ -188,8 +190,8 @@ ENTRY_POINT_GROUPS = {
 
 
 def entry_point_findings() -> list[Finding]:
-    """Return what other packages add through entry points, without importing it; misspelt groups are problems."""
-    found = {}
+    """Return the entry points of other packages, without importing them. Misspelt groups are problems."""
+    findings = {}
     for distribution in metadata.distributions():
         for entry in distribution.entry_points:
             source = f"{entry.value} of {distribution.name} {distribution.version}"
@@ -197,12 +199,12 @@ def entry_point_findings() -> list[Finding]:
                 continue
             if entry.group in ENTRY_POINT_GROUPS:
                 use = ENTRY_POINT_GROUPS[entry.group].format(entry.name)
-                found[entry.group, entry.name] = Finding(entry.name, "ok", f"{use}: {source}")
+                findings[entry.group, entry.name] = Finding(entry.name, "ok", f"{use}: {source}")
             elif entry.group.startswith((f"{PACKAGE}.", "lapgs.")):
                 detail = f"{source} is in the group {entry.group}, which nothing reads"
                 advice = f"name one of {', '.join(ENTRY_POINT_GROUPS)} in its pyproject.toml"
-                found[entry.group, entry.name] = Finding(entry.name, "problem", detail, advice)
-    return [found[key] for key in sorted(found)]
+                findings[entry.group, entry.name] = Finding(entry.name, "problem", detail, advice)
+    return [findings[key] for key in sorted(findings)]
 
 
 def own_requirements() -> dict[str, list[Requirement]]:
@@ -211,10 +213,10 @@ def own_requirements() -> dict[str, list[Requirement]]:
         parsed = [Requirement(text) for text in metadata.requires(PACKAGE) or []]
     except metadata.PackageNotFoundError:
         return {"": []}
-    always = [each for each in parsed if _applies(each, "")]
+    always = [requirement for requirement in parsed if _applies(requirement, "")]
     extras = metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
-    of_extras = {extra: [each for each in parsed if each not in always and _applies(each, extra)] for extra in extras}
-    return {"": always, **of_extras}
+    optional = [requirement for requirement in parsed if requirement not in always]
+    return {"": always, **{extra: [one for one in optional if _applies(one, extra)] for extra in extras}}
 
 
 def _applies(requirement: Requirement, extra: str) -> bool:
@@ -253,10 +255,10 @@ def triton_finding(torch: Probe) -> Finding:
 def extension_finding(module: str, purpose: str) -> Finding:
     """Report whether a compiled extension can be imported; an installed one is imported in another process."""
     try:
-        there = importlib.util.find_spec(module.partition(".")[0]) is not None
+        installed = importlib.util.find_spec(module.partition(".")[0]) is not None
     except (ImportError, ValueError) as error:
         return Finding(module, "problem", typed_line(error), "install it again")
-    if not there:
+    if not installed:
         return Finding(module, "absent", f"not installed ({purpose})")
     probe = run_probe("import", "torch", module)  # extensions find PyTorch's libraries after it is loaded
     if probe.error:

@@ -1,6 +1,6 @@
-"""Import in a process of its own what may crash the importing process, such as an extension built for another PyTorch.
+"""Run imports that may crash in processes of their own, such as of an extension built for another PyTorch.
 
-`python -m lapgs_plugin.environment.probes PROBE` prints the facts that the probe finds as JSON.
+`python -m lapgs_plugin.environment.probes PROBE` prints the facts of a probe as JSON.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from lapgs_plugin.errors import typed_line
 
 @dataclass(frozen=True)
 class Probe:
-    """Result of a probe.
+    """Hold the result of a probe.
 
     Attributes:
-        facts: what it found.
+        facts: by name; empty if the probe failed.
         error: one line; empty if it succeeded.
     """
 

@@ -15,14 +15,23 @@ from numpy.typing import DTypeLike, NDArray
 
 ALIGNMENT = 64
 """Bytes of a cache line, and of the widest vector."""
+
 SMALL = 2**20
-"""Bytes; smaller arrays come from the system's allocator, which reuses memory of this size itself."""
+"""Size in bytes below which arrays come from the system's allocator, which reuses such memory itself."""
+
 PATIENCE = 100
-"""Blocks not taken during this many requests, some six iterations, are returned to the system."""
+"""Number of requests, those of some six iterations, after which an unused block is returned to the system."""
 
 
 class _Block:
-    """Hold some bytes, and the number of the request after which they were returned."""
+    """Hold aligned memory.
+
+    Attributes:
+        size: in bytes.
+        memory: the bytes, a few more than `size`.
+        start: index of the first aligned byte.
+        returned: number of requests to the store before the block was returned to it.
+    """
 
     def __init__(self, size: int) -> None:
         self.size = size

@@ -32,10 +32,10 @@ def jit(function: _F) -> _F:
 
     The GIL is released while it runs. Division by zero gives inf or nan as in NumPy.
 
-    The machine code is cached on disk beside the module, or in the user's cache folder if that folder is read-only, or
-    nowhere if neither can be written. The cache is valid until the function's file, `lanes`, or a `layout`, `in_torch`
-    or `*_kernels` module in the same folder or the one above changes. Helpers that kernels call and constants that they
-    read must live in one of these.
+    The machine code is cached on disk beside the module, else in the user's cache folder, unless neither can be
+    written. The cache is valid until one of these files changes: the function's own, those of `_SHARED`, and `layout`,
+    `in_torch` and `*_kernels` modules in the same folder or the one above. Helpers and constants of kernels must live
+    in one of these.
     """
     compiled: Any = njit(nogil=True, error_model="numpy")(function)
     with suppress(RuntimeError):  # Numba found no folder to write to
@@ -51,7 +51,7 @@ def inline(function: _F) -> _F:
 
 
 class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
-    """Extend Numba's cache, which checks the function's file alone, to the files of helpers."""
+    """Invalidate cached code when the file of a helper changes, too. Numba checks the function's file alone."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -68,7 +68,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]  # see above
 def _helpers_stamp(folder: Path) -> str:
     """Hash the files whose functions and constants kernels in `folder` may use."""
     names = "layout.py", "in_torch.py", "*_kernels.py"
-    nearby = [path for place in (folder, folder.parent) for name in names for path in sorted(place.glob(name))]
+    nearby = [path for searched in (folder, folder.parent) for name in names for path in sorted(searched.glob(name))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in (*_SHARED, *nearby))).hexdigest()
 
 

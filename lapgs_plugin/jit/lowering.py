@@ -305,7 +305,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
     return builder.gep(data, [index])
 
 
-def _place(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> Any:
+def _element_pointer(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> Any:
     """Return a pointer to array[index + offset]; sig and args begin with the array and the index."""
     index = context.cast(builder, args[1], sig.args[1], _INDEX)
     offset = index.type(offset) if isinstance(offset, int) else offset
@@ -315,13 +315,13 @@ def _place(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> 
 def _load_part(context: Any, builder: Any, sig: Any, args: Any, offset: Any = 0) -> Any:
     """Load array[start + offset : ... + 16]; sig and args begin with the array and the start."""
     vector = ir.VectorType(context.get_value_type(sig.args[0].dtype), WIDTH)
-    pointer = builder.bitcast(_place(context, builder, sig, args, offset), vector.as_pointer())
+    pointer = builder.bitcast(_element_pointer(context, builder, sig, args, offset), vector.as_pointer())
     return builder.load(pointer, align=sig.args[0].dtype.bitwidth // 8)
 
 
 def _store_part(context: Any, builder: Any, sig: Any, args: Any, value: Any, offset: Any = 0) -> None:
     """Store array[start + offset : ... + 16] = value; sig and args begin with the array and the start."""
-    pointer = builder.bitcast(_place(context, builder, sig, args, offset), value.type.as_pointer())
+    pointer = builder.bitcast(_element_pointer(context, builder, sig, args, offset), value.type.as_pointer())
     builder.store(value, pointer, align=sig.args[0].dtype.bitwidth // 8)
 
 
@@ -338,7 +338,7 @@ def _lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     byte = ir.IntType(8).as_pointer()
     function_type = ir.FunctionType(ir.VoidType(), [byte, _INT32, _INT32, _INT32])
     function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0i8")
-    pointer = builder.bitcast(_place(context, builder, sig, args), byte)
+    pointer = builder.bitcast(_element_pointer(context, builder, sig, args), byte)
     builder.call(function, [pointer, _INT32(0), _INT32(3), _INT32(1)])  # for reading, into all levels, data
     return context.get_dummy_value()
 

@@ -50,13 +50,13 @@ class Block(NamedTuple):
 
 def find_blocks(source: str) -> list[Block]:
     """Return all blocks in a file, in order."""
-    found = []
+    blocks = []
     for match in _BLOCK.finditer(source):
         form = "c_" if match["l_sum"] is None else "l_"
         original = _unescape(match["was"] or "")
         intact = match[form + "sum"] == _checksum(match[form + "body"], original)
-        found.append(Block(match[form + "set"], match[form + "name"], match.start(), match.end(), original, intact))
-    return found
+        blocks.append(Block(match[form + "set"], match[form + "name"], match.start(), match.end(), original, intact))
+    return blocks
 
 
 def stray_marker(source: str) -> int | None:

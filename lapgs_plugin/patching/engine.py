@@ -19,10 +19,10 @@ from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recip
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
 
 ALL_SETS = "all"
-"""Name for all sets: all to revert, or all that are not opt-in to apply."""
+"""Name for all sets to revert, or for all to apply that are not opt-in."""
 
 DEPTH = 4
-"""How many folders below a checkout its extensions are searched: of a checkout within another one, too."""
+"""Depth of folders below a checkout at which extensions are searched, enough for a checkout inside another one."""
 
 _SKIPPED_FOLDERS = frozenset({"build", "dist", "third_party", "node_modules"})
 
@@ -79,7 +79,7 @@ def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tup
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
-        recipes: recipes of the extensions to find; None for all that come with this package.
+        recipes: of the extensions to find; None for all that come with this package.
 
     Raises:
         PatchError: `checkout` is not a folder or has no known extension.
@@ -102,7 +102,7 @@ def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
     """Return the changes that apply these sets and renew the sets that are applied already.
 
     Raises:
-        PatchError: an edit does not fit the sources; the message names the place and the expected code.
+        PatchError: an edit does not fit the sources; the message names file, line and expected code.
     """
     changes, problems = _try_apply(target, sets)
     _refuse(target, problems, "; a rasterizer that differs needs a recipe of its own, see `lapgs help patches`")
@@ -125,7 +125,7 @@ def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]
 def status(target: Target) -> tuple[SetStatus, ...]:
     """Return the state of each set of edits."""
     present = _present_sets(_read(target).values())
-    found = []
+    statuses = []
     for name in target.recipe.sets:
         changes, problems = _try_apply(target, [name])
         if problems:
@@ -136,8 +136,8 @@ def status(target: Target) -> tuple[SetStatus, ...]:
         else:
             current = all(_blocks(change.before, name) == _blocks(change.after, name) for change in changes)
             state = State.APPLIED if current else State.INCOMPLETE
-        found.append(SetStatus(name, state, tuple(problems)))
-    return tuple(found)
+        statuses.append(SetStatus(name, state, tuple(problems)))
+    return tuple(statuses)
 
 
 def pristine(data: bytes) -> bytes:
@@ -227,11 +227,11 @@ def _edited(source: str, edits: Sequence[Edit], checks: Sequence[tuple[Anchor, C
     for edit in edits:
         if any(unconditional(tokens, directive) for directive in edit.unless):
             continue
-        place, problem = _locate(source, tokens, edit.anchor, 1)
-        if place is None or problem is not None:
+        match, problem = _locate(source, tokens, edit.anchor, 1)
+        if match is None or problem is not None:
             problems.append(f"{problem} (edit {edit.label})")
             continue
-        start, end = tokens[place.start].start, tokens[place.stop - 1].end
+        start, end = tokens[match.start].start, tokens[match.stop - 1].end
         if edit.replace is not None:
             pieces.append((start, end, replacement(source, start, end, edit.label, edit.put)))
         else:
@@ -253,23 +253,23 @@ def _assembled(source: str, pieces: list[tuple[int, int, str]]) -> str:
 
 
 def _locate(source: str, tokens: list[Token], anchor: Anchor, times: int) -> tuple[range | None, str | None]:
-    """Return the first place of an anchor's tokens, and the problem if there are not `times` places."""
+    """Return the first occurrence of an anchor's tokens, and the problem if there are not `times` of them."""
     span = range(len(tokens))
     line = 1
     if anchor.function is not None:
-        found = definitions(tokens, anchor.function)
-        if len(found) != 1:
-            return None, f"{anchor.file}: expected one definition of {anchor.function}, found {len(found)}"
-        span = found[0]
+        bodies = definitions(tokens, anchor.function)
+        if len(bodies) != 1:
+            return None, f"{anchor.file}: expected one definition of {anchor.function}, found {len(bodies)}"
+        span = bodies[0]
         line = _line(source, tokens[span.start].start)
-    places = occurrences(tokens, anchor.find, span)
-    if len(places) != times:
+    matches = occurrences(tokens, anchor.find, span)
+    if len(matches) != times:
         scope = f"in {anchor.function} " if anchor.function else ""
         return None, (
             f"{anchor.file}:{line}: expected `{anchor.find}` {_times(times)} {scope}but found it "
-            f"{_times(len(places))}; this is not the code that the edit was written for"
+            f"{_times(len(matches))}; this is not the code that the edit was written for"
         )
-    return (places[0] if places else None), None
+    return (matches[0] if matches else None), None
 
 
 def _times(count: int) -> str:

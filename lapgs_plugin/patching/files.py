@@ -58,7 +58,7 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
         # The same order in every process prevents deadlocks.
         locked = [folder for folder in folders if locks.enter_context(_folder_lock(folder))]
         stuck = []
-        for path in sorted(each for file in files if file.parent in locked for each in _temporaries(file)):
+        for path in sorted(temporary for file in files if file.parent in locked for temporary in _temporaries(file)):
             try:
                 path.unlink(missing_ok=True)
             except OSError:  # a read-only folder: the caller says so, and the command may still work
@@ -102,9 +102,8 @@ def _writable(path: Path) -> bool:
 def _temporaries(file: Path) -> list[Path]:
     """Return the files beside `file` that `_beside` made."""
     name = re.compile(re.escape(f".{file.name}.") + _RANDOM + re.escape(_SUFFIX))
-    return [
-        each for each in file.parent.iterdir() if name.fullmatch(each.name) and each.is_file() and not each.is_symlink()
-    ]
+    beside = (path for path in file.parent.iterdir() if name.fullmatch(path.name))
+    return [path for path in beside if path.is_file() and not path.is_symlink()]
 
 
 @contextmanager

@@ -14,11 +14,11 @@ from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
 @dataclass(frozen=True)
 class Anchor:
-    """Name a place in the sources of an extension.
+    """Locate tokens in the sources of an extension.
 
     Attributes:
         file: path below the extension's folder, with forward slashes.
-        find: tokens at the place; formatting and comments do not matter. Empty if the file only has to exist.
+        find: the tokens; formatting and comments do not matter. Empty if the file only has to exist.
         function: function whose definition is searched; None for the whole file.
     """
 
@@ -31,15 +31,15 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Edit:
-    """Describe one small change at a place that must be unique, `[[edit]]` in a file.
+    """Describe one small change, `[[edit]]` in a file. Its tokens must occur once.
 
     Attributes:
         set: the set of edits that it belongs to, such as "signed-color".
         name: unique name in its set.
-        file, find, function: the place, see `Anchor`.
-        before: text to insert before the place's tokens.
-        replace: text to replace them with, instead of `before`.
-        unless: directives; the edit is not needed if the file has one of them outside of any condition.
+        file, find, function: see `Anchor`.
+        before: text to insert before the tokens.
+        replace: text to replace the tokens with, instead of `before`.
+        unless: directives that make the edit needless where the file has one outside of any condition.
 
     Raises:
         ValueError: a value is not usable.
@@ -67,7 +67,7 @@ class Edit:
 
     @property
     def anchor(self) -> Anchor:
-        """The place."""
+        """The location of its tokens."""
         return Anchor(self.file, self.find, self.function)
 
     @property
@@ -83,9 +83,10 @@ class Edit:
 
 @dataclass(frozen=True)
 class Check:
-    """Require that tokens occur exactly `times` times at each place, without which the set's edits would be wrong.
+    """Require that tokens occur exactly `times` times in each of some places, or the set's edits would be wrong.
 
     Attributes:
+        places: anchors without tokens.
         because: reason, which ends the message when the check fails.
 
     Raises:
@@ -105,8 +106,8 @@ class Check:
 
     @property
     def anchors(self) -> list[Anchor]:
-        """The places, with the tokens."""
-        return [replace(place, find=self.find) for place in self.places]
+        """The places with the tokens."""
+        return [replace(anchor, find=self.find) for anchor in self.places]
 
 
 def _require_tokens(find: str) -> None:
@@ -121,7 +122,7 @@ class Recipe:
     Attributes:
         name: stem of its file.
         title: name in messages.
-        present, absent: places that its folder must and must not have to be recognised.
+        present, absent: anchors that its folder must and must not have to be recognised.
         extends: name of the recipe that it inherits from.
         reinstall: command that builds and installs it again; `{folder}` stands for its folder.
         opt_in: sets that change ordinary calls; applying "all" leaves them out.
@@ -153,7 +154,7 @@ class Recipe:
     @property
     def files(self) -> tuple[str, ...]:
         """Files of its edits and checks."""
-        checked = [place.file for check in self.check for place in check.places]
+        checked = [anchor.file for check in self.check for anchor in check.places]
         return tuple(dict.fromkeys([*(edit.file for edit in self.edit), *checked]))
 
     def recognises(self, folder: Path) -> bool:

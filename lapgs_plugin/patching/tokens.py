@@ -1,4 +1,4 @@
-"""Find places in C++ and CUDA sources by their tokens, regardless of formatting.
+"""Find code in C++ and CUDA sources by its tokens, regardless of formatting.
 
 Text is decoded as latin-1, one character a byte: every position is a byte position, and decoding changes no byte of a
 file, valid UTF-8 or not.
@@ -55,7 +55,7 @@ def tokenize(source: str) -> list[Token]:
 
 
 def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[range]:
-    """Return the places of a sequence of tokens inside `span`, as ranges of token indices.
+    """Return where a sequence of tokens occurs inside `span`, as ranges of token indices.
 
     Bodies of macros are skipped, since no line can be inserted there. A pattern that starts with `#` finds directives.
     """
@@ -63,16 +63,16 @@ def occurrences(tokens: Sequence[Token], pattern: str, span: range) -> list[rang
     directives = wanted[:1] == ["#"]
     texts = [token.text for token in tokens]
     candidates = (i for i in range(span.start, span.stop - len(wanted) + 1) if texts[i] == wanted[0])
-    places = (range(i, i + len(wanted)) for i in candidates if texts[i : i + len(wanted)] == wanted)
-    return [place for place in places if directives or not any(tokens[i].in_directive for i in place)]
+    matches = (range(i, i + len(wanted)) for i in candidates if texts[i : i + len(wanted)] == wanted)
+    return [match for match in matches if directives or not any(tokens[i].in_directive for i in match)]
 
 
 def unconditional(tokens: Sequence[Token], directive: str) -> bool:
     """Return whether the file has a directive outside of every #if, so that it always applies."""
     depth = 0
-    places = {place.start for place in occurrences(tokens, directive, range(len(tokens)))}
+    starts = {match.start for match in occurrences(tokens, directive, range(len(tokens)))}
     for i, token in enumerate(tokens):
-        if i in places and depth == 0:
+        if i in starts and depth == 0:
             return True
         if token.text == "#" and token.in_directive and i + 1 < len(tokens):
             depth += (tokens[i + 1].text in _CONDITIONS) - (tokens[i + 1].text == "endif")
@@ -81,17 +81,17 @@ def unconditional(tokens: Sequence[Token], directive: str) -> bool:
 
 def definitions(tokens: Sequence[Token], name: str) -> list[range]:
     """Return the definitions of functions called `name` (qualified as in the file), from the name to the last brace."""
-    found = []
-    for place in occurrences(tokens, name, range(len(tokens))):
-        if place.start > 0 and tokens[place.start - 1].text == ":":
+    bodies = []
+    for match in occurrences(tokens, name, range(len(tokens))):
+        if match.start > 0 and tokens[match.start - 1].text == ":":
             continue  # the same name in another class or namespace
-        end = _matching(tokens, place.stop, "(")
+        end = _matching(tokens, match.stop, "(")
         while end is not None and end < len(tokens) and tokens[end].text in _AFTER_PARAMETERS:
             end += 1
         end = None if end is None else _matching(tokens, end, "{")
         if end is not None:
-            found.append(range(place.start, end))
-    return found
+            bodies.append(range(match.start, end))
+    return bodies
 
 
 def _matching(tokens: Sequence[Token], start: int, opening: str) -> int | None:
