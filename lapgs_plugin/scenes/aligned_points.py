@@ -16,7 +16,7 @@ from lapgs_plugin.scenes.point_cloud import PointCloud
 from lapgs_plugin.scenes.source import Frame
 
 FEWEST = 3
-"""Cameras that fix how a model lies in the world of the frames, if they are not at one point."""
+"""Fewest common cameras from which a similarity transform between two worlds is computed."""
 FIT = 1e-2
 """Largest error of a camera's rotation, and of its position as a share of the cameras' extent."""
 
@@ -24,13 +24,12 @@ FIT = 1e-2
 def aligned_points(path: Path, frames: Sequence[Frame]) -> PointCloud | None:
     """Return the points of the COLMAP model in a scene folder, in the world of the frames of its transforms file.
 
-    Photos are recognised by the last part of their names. None if there is no such model, or its cameras, however
-    turned, moved and scaled, are not those of the frames.
+    Photos are recognised by the last part of their names. None without such a model, or if no similarity transform maps
+    its cameras to those of the frames.
     """
-    folder = find_model(path, MODEL_PLACES)
     model = None
     with suppress(SceneError):
-        model = None if folder is None else read_model(folder)
+        model = None if (folder := find_model(path, MODEL_PLACES)) is None else read_model(folder)
     if model is None or not len(model.points.xyz):
         return None
     poses = {PurePosixPath(frame.name).name: frame.camera.world_to_camera.numpy()[:3] for frame in frames}
@@ -43,12 +42,12 @@ def aligned_points(path: Path, frames: Sequence[Frame]) -> PointCloud | None:
     turns, centers = _turns_and_centers([poses[name] for name in names])
     other_turns, other_centers = _turns_and_centers([others[name] for name in names])
     middle, other_middle = centers.mean(axis=0), other_centers.mean(axis=0)
-    extent, other_extent = (float(np.linalg.norm(each - each.mean(axis=0))) for each in (centers, other_centers))
+    extent, other_extent = (float(np.linalg.norm(part - part.mean(axis=0))) for part in (centers, other_centers))
     if not other_extent:
         return None
     scale, turn = extent / other_extent, turns[0] @ other_turns[0].T
 
-    points, fitted = (middle + scale * (each - other_middle) @ turn.T for each in (model.points.xyz, other_centers))
+    points, fitted = (middle + scale * (part - other_middle) @ turn.T for part in (model.points.xyz, other_centers))
     if np.abs(turn @ other_turns - turns).max() > FIT or np.abs(fitted - centers).max() > FIT * extent:
         return None
     warning = f"{path}: its transforms file names no PLY of points that is there; those of {model.folder} are used"

@@ -51,7 +51,7 @@ TEST_FRAMES = "test_frames"
 SPLITS = ("train", "val", "test")
 """Parts of a scene for which nerfstudio may list file names."""
 SHORTEST_FOCAL = 0.02
-"""Shortest focal length in sides of the image. Shorter ones are shares of the size rather than pixels."""
+"""Shortest focal length as a share of the image's side. A shorter one was not written in pixels."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -92,7 +92,7 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
         path: the scene folder.
         images: folder of the images, replacing the one in `file_path`; "images" keeps it if it is there.
         evaluate: hold out views.
-        lenses: receives those of the frames, whose cameras may be distorted then.
+        lenses: filled with the lenses of the frames, whose cameras may then be distorted. None refuses distorted ones.
 
     Raises:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
@@ -134,11 +134,11 @@ def _parted(
     if not evaluate:
         return in_name_order([*unseen, *held_out]), ()
     if repeated := len(train) - len(unseen):
-        what = f"{repeated} of {counted(len(train), 'training view')} are test views too: held out, not trained on"
+        outcome = f"{repeated} of {counted(len(train), 'training view')} are test views too: held out, not trained on"
         if not unseen:  # 3DGS trains on the views that it measures
             unseen, held_out = held_out, []
-            what = f"all {repeated} training views are test views too: every eighth view is held out instead"
-        warnings.append(f"{file}: {what}")
+            outcome = f"all {repeated} training views are test views too: every eighth view is held out instead"
+        warnings.append(f"{file}: {outcome}")
     return (in_name_order(unseen), in_name_order(held_out)) if held_out else hold_out(unseen, evaluate)
 
 
@@ -209,7 +209,7 @@ def _portable(name: str) -> str:
 
 
 def _is_bad(frame: Any) -> bool:
-    """Return whether ScanNet++ marks a frame as blurred."""
+    """Return whether a frame is marked as blurred, as in ScanNet++."""
     return isinstance(frame, dict) and bool(frame.get("is_bad"))
 
 
@@ -307,7 +307,7 @@ def _lens(values: Values, where: str) -> tuple[str, Values]:
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:
-    """Return the image of a frame; where it is missing, the place where it should be."""
+    """Return the image of a frame, or its expected path if it is missing."""
     written, folder = PurePosixPath(file_path), PurePosixPath(images)
     choices = [written]
     if images != "images":
@@ -316,11 +316,11 @@ def _image_path(path: Path, file_path: str, images: str) -> Path:
         # Programs write names without their folder, or with that of another machine.
         choices += [folder / written, folder / written.name]
     # instant-ngp writes ".." where its photos lie beside the scene.
-    places = [Path(os.path.normpath(path / choice)) for choice in choices]
+    paths = [Path(os.path.normpath(path / choice)) for choice in choices]
     spellings = (
-        image.with_name(image.name + suffix) for image in places if image.name for suffix in ("", *IMAGE_SUFFIXES)
+        image.with_name(image.name + suffix) for image in paths if image.name for suffix in ("", *IMAGE_SUFFIXES)
     )
-    return next((image for image in map(find_image, spellings) if is_file(image)), places[0])
+    return next((image for image in map(find_image, spellings) if is_file(image)), paths[0])
 
 
 def _world_to_camera(matrix: Any, where: str) -> NDArray[np.float64]:
@@ -407,13 +407,13 @@ def _read_points(transforms: Path, values: Values, frames: Sequence[Frame], warn
             f"{transforms}: ply_file_path is {named!r}, expected the name of a file; export the scene again"
         )
     name = PurePosixPath(_portable(named))
-    places = [find_image(path / spelling) for spelling in (name, name.name, *POINT_FILES)]
-    file = next((place for place in places if is_file(place)), None)
+    candidates = [find_image(path / spelling) for spelling in (name, name.name, *POINT_FILES)]
+    file = next(filter(is_file, candidates), None)
     if file is None:
         cloud = aligned_points(path, frames)
     else:
-        cloud = read_point_cloud(file, f"{transforms} names {file}" if file in places[:2] else f"{file}")
-    if named and file not in places[:2] and (file or not cloud):  # nerfstudio, too, takes random points then
+        cloud = read_point_cloud(file, f"{transforms} names {file}" if file in candidates[:2] else f"{file}")
+    if named and file not in candidates[:2] and (file or not cloud):  # nerfstudio, too, takes random points then
         warnings.append(f"{transforms} names {named}: no such file; training starts from {file or 'random points'}")
     if cloud and not len(cloud.xyz):
         warnings.append(f"{file}: no points in it; training starts from random points")

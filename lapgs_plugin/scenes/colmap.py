@@ -35,21 +35,22 @@ MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0")
 """Where COLMAP, nerfstudio and the 3DGS repository's convert.py leave models of photos that are not undistorted."""
 
 
-def find_model(path: Path, places: Sequence[str] = MODEL_PLACES[:2]) -> Path | None:
-    """Return the first of these places in `path` that holds files of a COLMAP model; None if there is none."""
-    for folder in (path / place for place in places):
+def find_model(path: Path, folders: Sequence[str] = MODEL_PLACES[:2]) -> Path | None:
+    """Return the first of these folders in `path` that holds a file of a COLMAP model; None without one."""
+    for folder in map(path.joinpath, folders):
         if any(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES for suffix in ("bin", "txt")):
             return folder
     return None
 
 
 def largest_model(path: Path, model: Path) -> Path:
-    """Return `model`, or the one of the numbered models in the scene `path` that has most photos, if it has more.
+    """Return the model with most photos: `model`, or one of the numbered models in the scene `path`.
 
-    COLMAP's mapper numbers a model for each group of photos that nothing connects as it finds them, not by size.
+    COLMAP's mapper writes a model for each connected group of photos, not numbered by size.
     """
-    beside = [each for place in MODEL_PLACES for each in sorted((path / place).parent.glob("[0-9]*")) if each != model]
-    return max([model, *beside], key=count_images) if beside else model
+    numbered = [folder for name in MODEL_PLACES for folder in sorted((path / name).parent.glob("[0-9]*"))]
+    others = [folder for folder in numbered if folder != model]
+    return max([model, *others], key=count_images) if others else model
 
 
 def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
@@ -79,7 +80,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
 
 
 def larger_model(path: Path, model: Path) -> tuple[str, ...]:
-    """Return a line if another model in a scene folder has more photos than the one that is read."""
+    """Return a warning if another model in a scene folder has more photos than the one that is read."""
     if (larger := largest_model(path, model)) == model:
         return ()
     return (
@@ -89,7 +90,7 @@ def larger_model(path: Path, model: Path) -> tuple[str, ...]:
 
 
 def with_bare_names(model: Model, folder: Path) -> Model:
-    """Return a model whose images are named without folders where only that names a file in `folder`.
+    """Return a model that names images without folders where no other name is that of a file in `folder`.
 
     Programs write the folder of the machine that they ran on, or that of the photos. Codebases of 3DGS ignore it.
     """
@@ -136,12 +137,12 @@ def why_no_points(path: Path) -> str:
         in_ply = len(read_point_cloud(ply, "").xyz)
     if not is_file(ply):
         return f"{model or path}: no points in it, expected some to start from; train with {train}, which makes them"
-    what = f"its {in_ply} points are not readable for this codebase" if in_ply else "no points in it"
+    problem = f"its {in_ply} points are not readable for this codebase" if in_ply else "no points in it"
     if not in_model:
-        return f"{ply}: {what}, expected x, y, z, nx, ny, nz, red, green and blue of each point; export it again"
+        return f"{ply}: {problem}, expected x, y, z, nx, ny, nz, red, green and blue of each point; export it again"
     return (
-        f"{ply}: {what}, expected the {in_model} of the model; remove the file, so that this codebase writes it again. "
-        f"If it is empty then, this codebase leaves out points without tracks: train with {train}"
+        f"{ply}: {problem}, expected the {in_model} of the model; remove the file, so that this codebase writes it "
+        f"again. If it is empty then, this codebase leaves out points without tracks: train with {train}"
     )
 
 

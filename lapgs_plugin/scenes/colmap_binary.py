@@ -28,7 +28,7 @@ _TRACK_BYTES = 4 + 4
 
 
 class BinaryRecords:
-    """The bytes of a file, taken one after the other. Bytes after the last record do not matter."""
+    """Take the bytes of a file one after the other. Bytes after the last record do not matter."""
 
     def __init__(self, file: Path) -> None:
         try:
@@ -139,8 +139,8 @@ def _whole(file: Path) -> Iterator[BinaryRecords]:
 
 def _check_id(file: Path, key: int, known: dict[int, Any]) -> None:
     if key in known or key > LARGEST_ID:
-        what = f"id {key} twice, expected each once" if key in known else f"id {key}, expected at most {LARGEST_ID}"
-        raise SceneError(f"{file}: {file.name} holds {what}; copy or export the model again")
+        problem = f"id {key} twice, expected each once" if key in known else f"id {key}, expected at most {LARGEST_ID}"
+        raise SceneError(f"{file}: {file.name} holds {problem}; copy or export the model again")
 
 
 def _decoded(file: Path, key: int, name: bytes) -> str:

@@ -19,7 +19,7 @@ from lapgs_plugin.scenes.colmap_records import rigid
 from lapgs_plugin.untrusted import require_regular
 
 Take = Callable[[str], float]
-"""Return the next value of a file, in a binary file of this format of `struct`."""
+"""Return the next value of a file; the argument is its format for `struct` in a binary file."""
 
 SENSORS = {"CAMERA": 0, "IMU": 1, "INVALID": -1}
 """Types of sensors in text files. Only cameras have images."""

@@ -33,10 +33,10 @@ ADVICE = {
     ),
     "points3D.ply": "codebases of 3DGS use the PLY: remove it if it is outdated",
 }
-"""What to do about files that other programs prefer."""
+"""Advice about contradicting files that other programs prefer, by their names."""
 
 _Entries = Mapping[Hashable, NDArray[np.float64]]
-"""What a file says of cameras, images or points, to compare with another file."""
+"""Numbers of a file's cameras or images by id or name, to compare with another file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Model:
         cameras: those of the images, and maybe others.
         images: in the order of the file.
         points: without tracks unless they were asked for.
-        warnings: a line for each file that says something else.
+        warnings: a line for each file that contradicts these.
     """
 
     folder: Path
@@ -121,7 +121,7 @@ def _read_points(file: Path, observations: bool = False) -> Points:
 
 
 def _contradictions(model: Model, suffix: str, points: list[Path]) -> Iterator[str]:
-    """Yield a line for each file beside those of a model that says something else."""
+    """Yield a line for each other file of a model that contradicts it."""
     folder = model.folder
     others = [(folder / f"frames.{suffix}", f"images.{suffix}"), *((file, points[0].name) for file in points[1:])]
     if suffix == "bin":  # text was exported to be read, or to be edited
@@ -130,16 +130,16 @@ def _contradictions(model: Model, suffix: str, points: list[Path]) -> Iterator[s
         if not is_file(file):
             continue
         try:
-            what = _difference(model, file, suffix)
+            difference = _difference(model, file, suffix)
         except (SceneError, ValueError, LookupError, ArithmeticError, OSError, struct.error):
-            what = "damaged"
-        if what:
+            difference = "damaged"
+        if difference:
             advice = ADVICE.get(file.name, "remove this one if it is outdated")
-            yield f"{file}: {what}; {used} is used, {advice}"
+            yield f"{file}: {difference}; {used} is used, {advice}"
 
 
 def _difference(model: Model, file: Path, suffix: str) -> str:
-    """Return what a file says otherwise than a model, or ""."""
+    """Describe how a file differs from a model; "" if it does not."""
     if file.stem == "points3D":
         count, own = len(_read_points(file).xyz), len(model.points.xyz)
         return "" if count == own else f"{counted(count, 'point')} in place of {own}"

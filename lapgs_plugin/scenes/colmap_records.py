@@ -53,7 +53,7 @@ class Points:
         errors: (n,) mean reprojection errors in pixels, NaN where there is none; empty unless asked for.
         tracks: for each point (k, 2) image ids and numbers of their features, which may not exist; empty unless asked
             for.
-        warning: a line for whoever trains on the points, or "".
+        warning: a line for the user who trains on the points, or "".
     """
 
     xyz: NDArray[np.float64]  # (n, 3)

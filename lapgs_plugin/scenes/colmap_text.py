@@ -33,7 +33,7 @@ from lapgs_plugin.untrusted import require_regular
 SHOWN = 60
 """Characters of a line that are quoted in a message."""
 NUMBERS = frozenset("0123456789+-.einfaEINFA \t")
-"""Characters of lines of numbers. Names of photos have others, if only in their suffixes."""
+"""Characters of lines of numbers. Names of photos have others, at least in their suffixes."""
 
 CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"
 IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME with finite numbers"
@@ -42,7 +42,7 @@ COLORS = "whole colours R G B from 0 to 255"
 
 
 class _Line:
-    """A line of a file: its first words, and the rest as the last one."""
+    """Split a line of a file into its first words, and the rest as the last one."""
 
     def __init__(self, file: Path, number: int, text: str, first_words: int) -> None:
         self.file, self.number, self.text = file, number, text
@@ -54,21 +54,21 @@ class _Line:
             f"{self.file}: line {self.number} is {quoted!r}, expected {expected}; copy or export the model again"
         )
 
-    def whole(self, words: Sequence[str], what: str) -> list[int]:
-        """Return words as whole numbers, which numpy writes as 1.0, or refuse the line; `what` was expected."""
-        values = self.finite(words, what)  # ids and sizes are below 2 ** 53, from which on these round
+    def whole(self, words: Sequence[str], expected: str) -> list[int]:
+        """Return words as whole numbers, such as 7 or numpy's 7.0, or refuse the line."""
+        values = self.finite(words, expected)  # exact, because ids and sizes are below 2 ** 53
         if not all(value.is_integer() for value in values):
-            self.refuse(what)
+            self.refuse(expected)
         return [int(value) for value in values]
 
-    def finite(self, words: Sequence[str], what: str) -> list[float]:
-        """Return words as finite numbers, or refuse the line; `what` was expected."""
+    def finite(self, words: Sequence[str], expected: str) -> list[float]:
+        """Return words as finite numbers, or refuse the line."""
         try:
             values = [float(word) for word in words]
         except ValueError:
-            self.refuse(what)
+            self.refuse(expected)
         if not all(map(math.isfinite, values)):
-            self.refuse(what)
+            self.refuse(expected)
         return values
 
 

@@ -1,9 +1,9 @@
 """Measure from the photos of a scene whether exposure and white balance change between them.
 
 Each sparse point is looked up in all photos that see it. A photo's gain is the factor by which its points are brighter
-than the same points in the other photos. Points hidden behind others are left out as far as nearer points tell; the
-rest of them disagree with the other photos widely, and count little. Gains are measured for the left and
-the right half of each photo separately: a change of exposure moves both halves alike, reflections and shadows do not.
+than the same points in the other photos. Points behind nearer points are left out. Other hidden points disagree widely
+between photos and get small weights. Gains are measured for the left and the right half of each photo separately: a
+change of exposure changes both halves alike, reflections and shadows do not.
 """
 
 from __future__ import annotations
@@ -20,15 +20,21 @@ from lapgs_plugin.scenes.scene import Scene, View
 POINTS = 4_000
 """Most sparse points that are looked up."""
 SIDE = 250
-"""Pixels of the longer side of photos that are looked at: a pixel then covers what blur and pose errors blend."""
-CELLS, DEPTH_MARGIN = 30, 1.05
-"""Points further than the nearest one of their cell times the margin count as hidden; a photo has CELLS x CELLS."""
-DARKEST, BRIGHTEST = 0.04, 0.96
-"""Values outside are noise or clipped, and tell nothing about a gain."""
-LEAST_POINTS, LEAST_VIEWS = 40, 4
-"""Fewest visible points of half a photo, and fewest photos of a point, with which a gain is measured."""
+"""Longer side in pixels of the photos that are looked up, so small that blur and pose errors are within a pixel."""
+CELLS = 30
+"""Cells along each side of a photo in which points hide each other."""
+DEPTH_MARGIN = 1.05
+"""Depth of a hidden point in multiples of its cell's least depth."""
+DARKEST = 0.04
+"""Least usable value; lower ones are noise."""
+BRIGHTEST = 0.96
+"""Greatest usable value; higher ones are clipped."""
+LEAST_POINTS = 40
+"""Fewest visible points of half a photo whose gain is measured."""
+LEAST_VIEWS = 4
+"""Fewest photos of a point that is used, and fewest photos with a gain."""
 BANDWIDTHS = (0.8, 0.8, 0.4, 0.4, 0.2, 0.2, 0.15, 0.15)
-"""Differences that count, in stops, in the steps of an estimate: narrower and narrower."""
+"""Widths in stops of the weights of differences, one for each step of an estimate."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class MeasuredExposure:
     Attributes:
         gains: (v, 3) base-2 logarithm of the gain of each photo and channel, with median 0 over photos; 0 where a photo
             shows too few points.
-        spread: robust standard deviation, in stops, of the photos' gains, without what its two halves disagree on.
+        spread: robust standard deviation of the photos' gains in stops, corrected for the disagreement of their halves.
     """
 
     gains: Tensor  # (v, 3)
@@ -48,13 +54,13 @@ class MeasuredExposure:
 def measure_exposure(scene: Scene) -> MeasuredExposure:
     """Measure how the exposure of a scene's training photos differs.
 
-    The spread is 0 if too few points are visible, or if all have one colour: these are made up, for scenes without any.
+    The spread is 0 if too few points are visible, or if all have one colour, as random points do.
     """
     if len(scene.points) and bool((scene.colors == scene.colors[0]).all()):
         return MeasuredExposure(torch.zeros(len(scene.train), 3), 0.0)
     chosen = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:POINTS]
     looked_up = [_colors_of(view, scene.points[chosen]) for view in scene.train]
-    colors, right = (torch.stack(each) for each in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)
+    colors, right = (torch.stack(views) for views in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)
     usable = ((colors > DARKEST) & (colors < BRIGHTEST)).all(-1)  # (v, n)
     often = usable.sum(0) >= LEAST_VIEWS
     usable, right = usable[:, often], right[:, often]
@@ -70,14 +76,14 @@ def measure_exposure(scene: Scene) -> MeasuredExposure:
     left, other = (_modes(brightness - points, half)[known] for half in halves)
     left, other = left - left.median(), other - other.median()
     for channel in range(3):
-        found, _ = _solve(colors[..., channel].log2(), weights)
-        gains[known, channel] = (found - found[known].median())[known]
+        logarithms, _ = _solve(colors[..., channel].log2(), weights)
+        gains[known, channel] = (logarithms - logarithms[known].median())[known]
     agreed, disagreed = (_robust_deviation((left + sign * other) / 2) for sign in (1, -1))
     return MeasuredExposure(gains, math.sqrt(max(0.0, agreed**2 - disagreed**2)))
 
 
 def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the colours (n, 3) of a photo at sparse points, 0 where it does not see them, and (n,) which are right."""
+    """Return a photo's colours (n, 3) at sparse points, 0 at unseen ones, and which are in its right half, (n,)."""
     step = max(1, round(max(view.camera.size) / SIDE))
     image, mask = view.image[None], view.mask
     small = torch.nn.functional.avg_pool2d(image, step) if step > 1 else image
@@ -93,7 +99,7 @@ def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points: (n,) x and y in image widths and heights, and which of them no nearer one seems to hide."""
+    """Project points: x and y (n,) in image widths and heights, and which are visible (n,)."""
     x, y, depth = camera.local(points).unbind(-1)
     x = (camera.fx * x / depth + camera.cx) / camera.width
     y = (camera.fy * y / depth + camera.cy) / camera.height
@@ -117,7 +123,7 @@ def _agreement(values: Tensor, usable: Tensor) -> Tensor:
 def _solve(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return gains (v,) of photos and values (n,) of points whose sums are closest to values (v, n), in least squares.
 
-    Solved for all photos at once: gains carry over between photos only through those that see the same points.
+    Solved for all photos at once, because gains are related only between photos that see the same points.
     """
     by_point = weights.sum(0).clamp_min(1e-6)
     means = (weights * values).sum(0) / by_point

@@ -1,5 +1,7 @@
-"""Check JPEG and PNG files before they are decoded: OpenImageIO allocates all that their header announces, and libpng
-prints errors to stderr itself."""
+"""Check JPEG and PNG files before they are decoded.
+
+OpenImageIO allocates the size that a header announces, and libpng prints errors to stderr.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,7 @@ def _jpeg_markers(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _png_damage(stream: BinaryIO, whole: bool) -> str:
-    """Return what is wrong with the chunks that a decoder needs; nothing if they are as they were written."""
+    """Describe the damage of the chunks that a decoder needs; "" if there is none."""
     size, kinds = os.fstat(stream.fileno()).st_size, list[bytes]()
     while len(head := stream.read(8)) == 8:
         length, kind = struct.unpack(">I4s", head)

@@ -40,7 +40,7 @@ FLOAT_FORMATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 CUT_SHORT = re.compile("premature end|marker 0xd9 instead", re.IGNORECASE)
 """Complaints of libjpeg about an image that ends early."""
 NAMED_DAMAGE = 5
-"""Most photos of a folder of which the decoder's complaints are shown: a camera writes all of its photos alike."""
+"""Most photos of a folder whose damage is logged, because a camera writes all of its photos alike."""
 STRIP_VALUES = 1 << 23
 """Values in a strip of rows. Large images are in memory as floating point one strip at a time."""
 
@@ -53,10 +53,10 @@ _named: defaultdict[Path, list[Path]] = defaultdict(list)
 
 
 def find_image(path: Path) -> Path:
-    """Return an image file, or else the only file beside it whose name differs in case, Unicode form or format alone.
+    """Return an image file, or the only file beside it whose name differs in case, Unicode form or format alone.
 
-    Photos are renamed so on their way between cameras and operating systems; smaller copies of JPEG files are often
-    PNG files, as gsplat's. Without such a file it is `path`.
+    Cameras and operating systems rename photos so. Smaller copies of JPEG files are often PNG files, as gsplat's.
+    Without such a file `path` is returned.
     """
     if is_file(path) or not is_folder(path.parent):
         return path
@@ -67,7 +67,7 @@ def find_image(path: Path) -> Path:
 
 @lru_cache(maxsize=8)
 def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
-    """Return the files of a folder by `_plain` name, and photos by `_any_format`; `changed`: when it last changed."""
+    """Return the files of a folder by `_plain` name, and photos by `_any_format`. `changed` renews the cache."""
     files: dict[str, list[Path]] = {}
     with suppress(PermissionError):  # opening the image says so
         for file in filter(is_file, folder.iterdir()):
@@ -91,14 +91,14 @@ def _any_format(file: Path) -> str:
 
 
 def where_else(scene: Path, name: str) -> str:
-    """Return what to do about a missing image: choose the folder of the scene that has it, or put the photos there."""
+    """Return advice about a missing image: choose the folder of the scene that has it, or put the photos there."""
     inside = [*sorted(folder.name for folder in scene.iterdir() if is_folder(folder)), "."]
     others = [folder for folder in inside if is_file(find_image(scene / folder / name))]
     return f"choose {' or '.join(others)} with --images" if others else "put the photos there"
 
 
 def not_there(path: Path) -> str:
-    """Return the beginning of the message about an image that is not there, which says where a link leads."""
+    """Return the beginning of the message about a missing image, with the target of a broken link."""
     link = f": it is a link to {path.readlink()}, which is not there" if path.is_symlink() else ""
     return f"{path}: no such image{link}"
 
@@ -212,7 +212,7 @@ def open_by_pillow(path: Path, problem: str) -> Iterator[Image.Image]:
 
     Args:
         path: the file.
-        problem: what it means if Pillow cannot decode it, for the message.
+        problem: of an image that Pillow cannot decode, for the message.
 
     Raises:
         SceneError: the image is too large, or the block raised an error.
@@ -231,7 +231,7 @@ def open_by_pillow(path: Path, problem: str) -> Iterator[Image.Image]:
 def _resize_8_bits(
     source: Image.Image, size: tuple[int, int], background: tuple[float, float, float] | None
 ) -> Image.Image:
-    """Return what Pillow's `resize` makes of an image, blended before if there is a background, as RGB or RGBA.
+    """Resize an image as Pillow's `resize` does, after blending it over the background if there is one; RGB or RGBA.
 
     A large image is converted one strip of rows at a time. Pillow, too, resizes along rows first, then along columns,
     and rounds to 8 bits after each.
@@ -410,8 +410,8 @@ def _strips(
     left, top = (spec.x - spec.full_x, spec.y - spec.full_y) if windowed else (0, 0)
     channels = _channels(spec)
     if not channels.colour or spec.depth > 1 or spec.deep:
-        what = "is a volume" if spec.depth > 1 or spec.deep else "has no colours"
-        raise SceneError(f"{path}: the image {what}, expected grey or RGB pixels; render or export it again")
+        problem = "is a volume" if spec.depth > 1 or spec.deep else "has no colours"
+        raise SceneError(f"{path}: the image {problem}, expected grey or RGB pixels; render or export it again")
     count = max(*channels.colour, channels.alpha) + 1
     step = max(1, STRIP_VALUES // (count * max(width, spec.width)))
     step = -(-step // spec.tile_height) * spec.tile_height if spec.tile_width else step
@@ -459,7 +459,7 @@ def _read_rows(path: Path, source: oiio.ImageInput, first: int, last: int, chann
 
 
 def _refuse_cut_jpeg(path: Path, complaint: str) -> None:
-    """Refuse a JPEG that ends early, of which the decoder makes the rest grey; log complaints of other damage.
+    """Refuse a JPEG that ends early, whose rest decoders make grey; log complaints about other damage.
 
     Only the decoder's first complaint is known. It may be about harmless bytes between segments.
     """
@@ -482,7 +482,13 @@ def _log_once(path: Path, complaint: str) -> None:
 
 
 class _Channels(NamedTuple):
-    """Channels of red, green and blue; channel of alpha, -1 for none; whether colour is not premultiplied by alpha."""
+    """Indices of an image's channels.
+
+    Attributes:
+        colour: of red, green and blue.
+        alpha: of alpha; -1 for none.
+        straight: whether colour is not premultiplied by alpha.
+    """
 
     colour: list[int]
     alpha: int
@@ -491,7 +497,7 @@ class _Channels(NamedTuple):
 
 def _channels(spec: oiio.ImageSpec) -> _Channels:
     alpha, straight = spec.alpha_channel, bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
-    if alpha >= spec.nchannels:  # OpenImageIO's GIF reader counts from one, and does not tell that colour is straight
+    if alpha >= spec.nchannels:  # OpenImageIO's GIF reader counts from one, and leaves out that colour is straight
         alpha, straight = spec.channelindex("A"), True
     colour = [channel for channel in range(spec.nchannels) if channel != alpha][:3]
     return _Channels(colour if len(colour) == 3 else colour[:1] * 3, alpha, straight)

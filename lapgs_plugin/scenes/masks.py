@@ -29,7 +29,7 @@ def has_photo_suffix(file: PurePath) -> bool:
 
 
 def resolve_masks(scene: Path, setting: str) -> str:
-    """Return what a value of --masks means for a scene: "none", "alpha", or a folder relative to the scene or absolute.
+    """Resolve a value of --masks for a scene: "none", "alpha", or a folder, relative to the scene or absolute.
 
     Raises:
         UserInputError: there is no such folder, or the link in its place leads to none.
@@ -49,8 +49,8 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
 
     The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder. A
-    folder that holds all photos, such as images/, may be left out. Other folders are not searched: one that is named
-    by mistake may be a whole disk.
+    folder that holds all photos, such as images/, may be left out. Other folders are not searched, because `folder` may
+    be a whole disk by mistake.
 
     Raises:
         SceneError: an image has no mask, or several.
@@ -58,20 +58,20 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     common = common_folder(names)
     shorter = {name: name.removeprefix(common) for name in names}
     parents = {PurePosixPath(name).parent for name in (*names, *shorter.values())}
-    places = [place for parent in parents if is_folder(place := folder / parent)]
-    files = [file for place in places for file in place.iterdir() if is_photo(file)]
+    searched = filter(is_folder, (folder / parent for parent in parents))
+    files = [file for inner in searched for file in inner.iterdir() if is_photo(file)]
     present: dict[str, list[Path]] = {}
     for file in sorted(files):  # cameras write .JPG, other programs .jpg
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
-    found = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
-    if missing := [shorter[name] for name, path in found.items() if path is None]:
+    masks = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
+    if missing := [shorter[name] for name, path in masks.items() if path is None]:
         stem = _stem(missing[0])
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
             f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
             "whole photo), or use no masks (in training: --masks none)"
         )
-    return {name: path for name, path in found.items() if path is not None}
+    return {name: path for name, path in masks.items() if path is not None}
 
 
 def common_folder(names: Sequence[str]) -> str:
@@ -81,7 +81,7 @@ def common_folder(names: Sequence[str]) -> str:
 
 
 def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None:
-    """Check that no photo counts as its own mask, as happens if --masks names the folder of the photos.
+    """Check that no photo is its own mask, as if --masks names the folder of the photos.
 
     Raises:
         SceneError: one is, or a mask is no file.
@@ -101,9 +101,9 @@ def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None
 def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | None:
     stem = _stem(name)
     whole = [name] if stem != name else [f"{name}{suffix}" for suffix in SUFFIXES]  # a checkout's name without suffix
-    spellings = [f"{each}.png" for each in whole]
+    spellings = [f"{name}.png" for name in whole]
     spellings += [f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES]
-    files = [file for each in spellings for file in present.get(each.lower(), ())]
+    files = [file for spelling in spellings for file in present.get(spelling.lower(), ())]
     if len(files) > 1:
         raise SceneError(
             f"{folder}: photo {printable(name)} has the masks {printable(files[0].name)} and "
@@ -151,7 +151,7 @@ def alpha_mask(photo: Path, size: tuple[int, int]) -> Tensor | None:
     """
     if not has_alpha(photo):
         return None
-    black, white = (read_image(photo, size=size, background=(each,) * 3, clamp=False)[:1] for each in (0.0, 1.0))
+    black, white = (read_image(photo, size=size, background=(grey,) * 3, clamp=False)[:1] for grey in (0.0, 1.0))
     opaque = 1.0 - (white - black)
     return None if bool((opaque > 0.5).all()) else _inside(opaque, photo)
 

@@ -23,7 +23,7 @@ _Result = TypeVar("_Result")
 def bar(
     title: str, unit: str, progress: bool | ProgressCallback, total: int | None = None
 ) -> Iterator[ProgressCallback]:
-    """Show a bar on stderr if `progress` is True; yield what to call with finished items and their total."""
+    """Show a bar on stderr if `progress` is True; yield the callback for finished items and their total."""
     if progress is not True:
         yield progress or (lambda done, total: None)
         return
@@ -45,9 +45,9 @@ def in_threads(
 
     Args:
         title, unit: of the progress bar.
-        work: what to do.
-        items: what to do it with.
-        most: number of threads; None for one a processor that this process may use.
+        work: function of an item.
+        items: its arguments.
+        most: number of threads. Default: usable processors.
         progress: True shows a bar on stderr, False nothing; a function is called after each item.
     """
     results = []

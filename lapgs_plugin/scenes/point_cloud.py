@@ -20,13 +20,15 @@ COLOR_NAMES = (
 )
 """Names of a point's colour, in lower case; the last are spherical harmonics of degree 0 in files of 3DGS."""
 RANGES = (1.0, 255.0, 65535.0)
-"""Full brightness of colours; whole numbers have the last two."""
+"""Values of full brightness; integers have one of the last two."""
 MOST = (0.01, 0.99)
-"""Quantiles of colours that tell their range; few are far outside of it, such as highlights."""
+"""Quantiles of colours that decide on their range. Few colours, such as highlights, are far outside of it."""
 DARK = 0.1
-"""Share of the range below which most colours are dark: they may have fewer bits, such as 12, or none."""
-UNDERSHOOT, OVERSHOOT = 0.05, 1.0
-"""How far these may be outside, as a share of the range: resampled colours are."""
+"""Share of the range below which most colours are suspiciously dark, as if they had fewer bits, such as 12."""
+UNDERSHOOT = 0.05
+"""Excess of resampled colours below 0, as a share of the range."""
+OVERSHOOT = 1.0
+"""Excess of colours above the range, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +37,8 @@ class PointCloud:
 
     Attributes:
         xyz: (n, 3) float64.
-        rgb: (n, 3) float64 in [0, 1], which resampled colours may leave a little.
-        warning: a line for whoever trains on the points, or "".
+        rgb: (n, 3) float64 in [0, 1]; resampled colours may be slightly outside.
+        warning: a line for the user who trains on the points, or "".
     """
 
     xyz: NDArray[np.float64]  # (n, 3)
@@ -80,7 +82,7 @@ def read_point_cloud(file: Path, subject: str) -> PointCloud:
 
 
 def _range(values: NDArray[np.generic], subject: str) -> tuple[float, float]:
-    """Return the value of full brightness of colours (n, 3), by their values, and what most are not above."""
+    """Return the value of full brightness of colours (n, 3), and the quantile below which most of them are."""
     finite = values[np.isfinite(values)].astype(np.float64)
     least, most = np.quantile(finite, MOST) if finite.size else (0.0, 0.0)
     ranges = RANGES if values.dtype.kind == "f" else RANGES[1:]

@@ -14,7 +14,7 @@ OBJECT_RADIUS = 1.3 / 4.03
 """Half the side of the cube of random points for a Blender scene, in mean distances of the cameras from its centre.
 3DGS uses 1.3 for NeRF's objects, whose cameras are 4.03 away."""
 CAPTURE_RADIUS = 1.0
-"""The same for photos that also show the surroundings."""
+"""Half the side of the cube, in the same unit, for photos that also show the surroundings."""
 
 
 def random_points(

@@ -42,12 +42,13 @@ from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
 MAX_WORKERS = 16
 LEAST_PLACES = NEIGHBOURS + 1
-SAMPLED_POINTS, SAMPLED_VIEWS = 10_000, 100
-"""Most points and views of which depths are measured."""
+SAMPLED_POINTS = 10_000
+"""Most points of which depths are measured."""
+SAMPLED_VIEWS = 100
+"""Most views in which depths are measured."""
 EXTENT_MARGIN = 1.1
 ROUNDED = 0.25
-"""Pixels to which positions may be rounded: from there on rounding shows. Models in coordinates of a map are further
-from the origin."""
+"""Largest rounding error of positions in pixels. Models in coordinates of a map have larger, visible ones."""
 
 logger = logging.getLogger(__name__)
 
@@ -167,8 +168,8 @@ def load_scene(
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
-        check: is called before any image is read, with `Scene.smallest_size` and the number of training views; what it
-            raises ends the loading.
+        check: called before any image is read, with `Scene.smallest_size` and the number of training views. An error
+            that it raises ends the loading.
         hold: keep the images in memory. False reads each once, to find damaged ones, and again at each use.
 
     Raises:
@@ -192,8 +193,8 @@ def load_scene(
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
     if short:
         logger.warning(
-            "--resolution %s: %d of %d images are only %d pixels wide or less and keep their size, images only shrink",
-            *(resolution, len(short), len(frames), max(short)),
+            f"--resolution {resolution}: {len(short)} of {len(frames)} images are only {max(short)} pixels wide or "
+            "less and keep their size, images only shrink"
         )
     depth = _median_depth(source.points, source.train)
     _warn_if_rounded(path, source.train, max(camera.fx for camera in cameras), depth)
@@ -296,27 +297,25 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
         source = read_transforms(path, images, evaluate)
     else:
         raise SceneError(
-            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; {_what_to_give(path)}"
+            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; {_advice_about(path)}"
         )
     check_source(path, source)
     return source
 
 
-def _what_to_give(path: Path) -> str:
+def _advice_about(path: Path) -> str:
     """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
     if find_model(path, MODEL_PLACES) is not None:
         return f"make a scene of its photos and its model with `lapgs prepare {quote(str(path))} OUT`"
     inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
     folders = [*inside, *path.parents[:3]]
-    if (scene := next((each for each in folders if find_model(each) or has_transforms(each)), None)) is not None:
+    if (scene := next((inner for inner in folders if find_model(inner) or has_transforms(inner)), None)) is not None:
         return f"give {scene}, which has one"
     if find_model(path, (".",)) is not None:
         folder = quote(str(path))
         return f"make a scene of its photos and its model with `lapgs prepare {folder} OUT --model {folder}`"
     known = (path / name for name in ("keyframes/images", "images", "input", "."))  # the first is Polycam's
-    photos = next(
-        (quote(str(each)) for each in known if any(has_photo_suffix(file) for file in each.glob("*"))), "PHOTOS"
-    )
+    photos = next((quote(str(inner)) for inner in known if any(map(has_photo_suffix, inner.glob("*")))), "PHOTOS")
     return f"make a scene from photos with `lapgs prepare {photos} OUT`"
 
 
@@ -334,8 +333,8 @@ def check_source(path: Path, source: SceneSource) -> None:
         raise SceneError(
             f"{path}: {counted(len(source.train), 'training view')}{held_out}, expected at least 2; {hint}"
         )
-    uses = Counter(each for frame in frames for each in (frame.name, frame.path))
-    if (double := next((each.name for each in frames if uses[each.name] + uses[each.path] > 2), None)) is not None:
+    uses = Counter(key for frame in frames for key in (frame.name, frame.path))
+    if (double := next((frame.name for frame in frames if uses[frame.name] + uses[frame.path] > 2), None)) is not None:
         raise SceneError(f"{path}: image {double} is listed twice, expected each once; remove one of its entries")
     if len(missing := [frame for frame in frames if not is_file(frame.path)]) > 1:
         some = len(missing) < len(frames)
@@ -377,7 +376,7 @@ def _sized_camera(frame: Frame, rule: Resolution) -> Camera:
 
 
 def check_shape(frame: Frame, size: tuple[int, int]) -> None:
-    """Raise a SceneError if an image file of this width and height is no copy of what its camera took."""
+    """Raise a SceneError if the shape of an image file, of this width and height, is not that of its camera."""
     if not same_shape(size, frame.camera.size):
         width, height = frame.camera.size
         raise SceneError(
@@ -411,9 +410,9 @@ def _warn_if_rounded(path: Path, train: Sequence[Frame], focal: float, depth: fl
     rounded = float(np.spacing(np.float32(away))) * focal / depth  # pixels
     if rounded > ROUNDED:
         logger.warning(
-            "%s: the cameras are %.3g from the origin, where float32 rounds positions to %.1g pixels: fine detail is "
-            "lost; move cameras and points to the origin, for example with COLMAP's model_transformer",
-            *(path, away, rounded),
+            f"{path}: the cameras are {away:.3g} from the origin, where float32 rounds positions to {rounded:.1g} "
+            "pixels: fine detail is lost; move cameras and points to the origin, for example with COLMAP's "
+            "model_transformer"
         )
 
 
@@ -433,7 +432,7 @@ def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:
 
 
 def require_places(points: Tensor, whose: str) -> None:
-    """Check that points (n, 3) are at enough places to have sizes. They are counted among some, if that is enough.
+    """Check that points (n, 3) are at enough different places to have sizes. A sample is checked first.
 
     Args:
         points: of a scene.
@@ -451,5 +450,5 @@ def require_places(points: Tensor, whose: str) -> None:
 
 
 def some_of(points: Tensor) -> Tensor:
-    """Return at most `SAMPLED_POINTS` of some points (n, 3)."""
+    """Return an evenly spread sample of points (n, 3), at most `SAMPLED_POINTS`."""
     return points[:: len(points) // SAMPLED_POINTS + 1]

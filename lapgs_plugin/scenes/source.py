@@ -14,7 +14,7 @@ from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 
 HOLD_OUT_EVERY = 8
-"""With --eval, every eighth view in name order is held out, starting with the first, as in 3DGS."""
+"""Step in name order from each view that --eval holds out to the next, from the first view on, as in 3DGS."""
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
@@ -56,7 +56,7 @@ class SceneSource:
         train, test: in name order.
         points: (n, 3) float64 positions in world units.
         colors: (n, 3) float64 RGB in [0, 1].
-        warnings: lines for whoever trains on the scene.
+        warnings: lines for the user who trains on the scene.
     """
 
     kind: str
@@ -68,17 +68,17 @@ class SceneSource:
 
 
 def undistort_hint(scene: Path, model: str) -> str:
-    """Return what to do about distorted cameras, of this camera model, of a scene."""
+    """Return advice about a scene's distorted cameras of this camera model."""
     if model == ALL_AROUND:
         return ALL_AROUND_HINT
     return f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`"
 
 
-def check_camera(who: str, camera: Camera) -> None:
+def check_camera(subject: str, camera: Camera) -> None:
     """Refuse a camera that cannot be trained on or rendered from.
 
     Args:
-        who: the file and which of its cameras, the subject of messages.
+        subject: of messages: the file and its camera.
         camera: the camera, in float64.
 
     Raises:
@@ -87,7 +87,7 @@ def check_camera(who: str, camera: Camera) -> None:
     numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     pose, size = camera.world_to_camera.numpy(), camera.size
     furthest, lens = np.abs(pose).max(), f"focal lengths {camera.fx:g} and {camera.fy:g}"
-    for wrong, what in (
+    for wrong, problem in (
         (not (np.isfinite(numbers).all() and np.isfinite(pose).all()), "NaN or inf"),
         (furthest > LARGEST, f"{furthest:g} in its pose, expected at most {LARGEST:g}"),
         (min(camera.fx, camera.fy, *size) <= 0, f"{size[0]}x{size[1]} pixels and {lens}, expected positive numbers"),
@@ -99,7 +99,7 @@ def check_camera(who: str, camera: Camera) -> None:
         ),
     ):
         if wrong:
-            raise SceneError(f"{who} has {what}; reconstruct or export it again")
+            raise SceneError(f"{subject} has {problem}; reconstruct or export it again")
 
 
 def in_name_order(frames: Sequence[Frame]) -> tuple[Frame, ...]:

@@ -18,8 +18,7 @@ from lapgs_plugin.limits import PHOTO_PIXELS
 from lapgs_plugin.scenes.images import JPEG
 
 FRAMES_PER_SECOND = 2.0
-FEWEST, MOST = 40, 240
-"""Frames that are picked by default: two for each second of the clip, within these bounds."""
+FEWEST, MOST = 40, 240  # frames that are picked by default
 JUDGED_WIDTH = 640
 """Width at which sharpness and motion are judged."""
 BLOCK = 8
@@ -42,7 +41,7 @@ def pick_frames(clip: Path, count: int | None, seen: Callable[[int, int], None])
 
     Args:
         clip: the video.
-        count: number of frames; None for two a second. Parts in which the camera stands still give none.
+        count: number of frames. Default: 2 per second, clamped to [40, 240]. Parts without motion give none.
         seen: called with frames read so far and their expected number.
 
     Raises:

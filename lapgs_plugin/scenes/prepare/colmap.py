@@ -23,18 +23,21 @@ from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRIEVAL, SEQUENTIAL, PrepareSettings
 
 VERIFIED = 15
-"""Fewest matches that agree on a geometry for two photos to count as showing the same, as in COLMAP's mapper."""
+"""Fewest matches of one geometry that link two photos, as in COLMAP's mapper."""
 MOST_GUIDED = 500
 """Most pairs that are matched again, guided by their geometry, which takes seconds a pair on a processor."""
 MOST_EXHAUSTIVE = 500
-"""Most photos of which all pairs are compared, unless a matcher was chosen; of more, those that look alike."""
+"""Most photos of which the matcher "auto" compares all pairs."""
 SIMILAR = 40
 """Photos that each photo is compared with by the matcher "retrieval"."""
 HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
 HAS_VOCABULARY = hasattr(getattr(pycolmap, "VisualIndex", None), "build")
-LOOP_FROM, LOOP_EVERY, LOOP_SIMILAR = 40, 10, 20
-"""Sequential matching of so many photos or more also compares every tenth with those that look most like it, because
-the camera may come back to a place."""
+LOOP_FROM = 40
+"""Fewest photos of which sequential matching looks for loops, because the camera may come back to a place."""
+LOOP_EVERY = 10
+"""Step between photos that are compared with similar ones to find loops."""
+LOOP_SIMILAR = 20
+"""Similar photos that each of these is compared with."""
 DEFAULT_MODEL = "OPENCV"
 """Camera model that "auto" fits first."""
 
@@ -62,13 +65,13 @@ def chosen_matcher(job: Job) -> str:
     """Return the matcher that the user chose, or the one for the kind and number of photos."""
     if job.settings.matcher != AUTO:
         return job.settings.matcher
-    if job.found.clip is not None:
+    if job.source.clip is not None:
         return SEQUENTIAL
     return RETRIEVAL if len(job.names) > MOST_EXHAUSTIVE and HAS_VOCABULARY else EXHAUSTIVE
 
 
 def find_features(job: Job, single_camera: bool) -> None:
-    """Find the features of all photos; `single_camera`: give them one camera."""
+    """Find the features of all photos, and give them one camera if `single_camera`."""
     asked = job.settings.camera_model
     options = {
         "photos": str(job.photos.absolute()),
@@ -78,10 +81,8 @@ def find_features(job: Job, single_camera: bool) -> None:
         "max_size": job.settings.max_size,
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
-    _run_step(
-        *(job, "features", options),
-        [Phase("Finding features", "photos", len(job.names), lambda: _rows(job.database, "descriptors"))],
-    )
+    phase = Phase("Finding features", "photos", len(job.names), lambda: _rows(job.database, "descriptors"))
+    _run_step(job, "features", options, [phase])
 
 
 def match_pairs(job: Job) -> None:
@@ -105,33 +106,31 @@ def match_more(job: Job) -> Path | None:
     Returns:
         The database; None if there are no such pairs, or more than `MOST_GUIDED`.
     """
-    found = job.work / "guided.db"
+    guided = job.work / "guided.db"
     with closing(sqlite3.connect(job.database)) as connection:
         known = "FROM two_view_geometries WHERE rows >= ?"
         (total,) = connection.execute(f"SELECT COUNT(*) {known}", (VERIFIED,)).fetchone()
     if not 0 < total <= MOST_GUIDED:
         return None
-    if not found.is_file():
-        partial = found.with_suffix(".partial")
+    if not guided.is_file():
+        partial = guided.with_suffix(".partial")
         _copy(job.database, partial)
         with closing(sqlite3.connect(partial)) as connection, connection:
             # COLMAP matches pairs without a geometry again.
             connection.execute(f"DELETE {known}", (VERIFIED,))
         before = _rows(partial, "two_view_geometries")
         options = {**_pairing(job), "database": str(partial.absolute()), "guided": True}
-        _run_step(
-            *(job, "pairs", options),
-            [Phase("Matching more", "pairs", total, lambda: _rows(partial, "two_view_geometries") - before)],
-        )
+        phase = Phase("Matching more", "pairs", total, lambda: _rows(partial, "two_view_geometries") - before)
+        _run_step(job, "pairs", options, [phase])
         with closing(sqlite3.connect(partial)) as connection:
             # COLMAP leaves matches in its log if the progress bar reads the database while COLMAP closes it.
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        partial.rename(found)
-    return found
+        partial.rename(guided)
+    return guided
 
 
 def _copy(database: Path, copy: Path) -> None:
-    """Copy a database with its write-ahead log; that of a copy that was interrupted would be added to the new one."""
+    """Copy a database with its write-ahead log, after removing an interrupted copy, whose log would be added."""
     for suffix in ("", "-wal", "-shm"):
         Path(f"{copy}{suffix}").unlink(missing_ok=True)
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
@@ -150,7 +149,7 @@ def _pairing(job: Job) -> dict[str, Any]:
 
 
 def _loops(job: Job) -> int:
-    """Return how many photos sequential matching also compares with those that look most like them."""
+    """Return how many photos sequential matching also compares with similar ones."""
     return -(-len(job.names) // LOOP_EVERY) if len(job.names) >= LOOP_FROM and HAS_VOCABULARY else 0
 
 
@@ -204,7 +203,7 @@ def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
         for written in unfinished.iterdir():
             check_written(written)
         unfinished.rename(folder)
-    return [pycolmap.Reconstruction(each) for each in sorted(folder.iterdir())]
+    return [pycolmap.Reconstruction(model) for model in sorted(folder.iterdir())]
 
 
 def _rows(database: Path, table: str) -> int:
@@ -286,7 +285,7 @@ def _show_phase(worker: subprocess.Popen[bytes], phase: Phase, seen: ProgressCal
         with suppress(subprocess.TimeoutExpired):
             worker.wait(POLL_SECONDS)
         done = max(done, phase.done())  # a database that is busy tells nothing
-        seen(min(done, total - 1), total)  # COLMAP goes on after its last item
+        seen(min(done, total - 1), total)  # COLMAP works on after its last item
     if not worker.returncode:
         seen(total if phase.complete else min(max(done, phase.done()), total), total)
 

@@ -24,26 +24,26 @@ logger = logging.getLogger(__name__)
 
 def make_photos(job: Job) -> None:
     """Write frames of the video, or copies of the photos with HEIC and WebP as JPEG files, if COLMAP needs them."""
-    found, folder = job.found, job.work / "photos"
-    if not found.made or folder.is_dir():
+    source, folder = job.source, job.work / "photos"
+    if not source.needs_copies or folder.is_dir():
         return
     partial = job.work / "photos.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
-    if found.clip is not None:
+    if source.clip is not None:
         with job.bar("Looking for sharp frames", "frames") as seen:
-            numbers = pick_frames(found.clip, job.settings.frames, seen)
+            numbers = pick_frames(source.clip, job.settings.frames, seen)
         with job.bar("Writing frames", "frames") as seen:
-            write_frames(found.clip, numbers, partial, seen)
-        logger.info("%s: %d sharp frames, evenly spread", found.clip, len(numbers))
+            write_frames(source.clip, numbers, partial, seen)
+        logger.info("%s: %d sharp frames, evenly spread", source.clip, len(numbers))
     else:
-        for name, source in found.files.items():
+        for name, file in source.files.items():
             (partial / name).parent.mkdir(parents=True, exist_ok=True)
-            require_readable(source)
-            if name not in found.converted:
-                shutil.copy2(source, partial / name)
+            require_readable(file)
+            if name not in source.converted:
+                shutil.copy2(file, partial / name)
         job.each_photo(
-            "Converting photos", lambda name: convert_photo(found.files[name], partial / name), found.converted
+            "Converting photos", lambda name: convert_photo(source.files[name], partial / name), source.converted
         )
     partial.rename(folder)
 
@@ -55,8 +55,8 @@ def make_masks(job: Job) -> None:
     """
     if job.masks.is_dir():
         return
-    given = job.settings.masks
-    files = {} if given is None else _given_masks(job, given)
+    folder = job.settings.masks
+    files = {} if folder is None else _user_masks(job, folder)
     if not files and not any(has_alpha(job.photo(name)) for name in job.names):
         return
     partial = job.work / "masks.partial"
@@ -73,20 +73,19 @@ def make_masks(job: Job) -> None:
         partial.rename(job.masks)
 
 
-def _given_masks(job: Job, folder: Path) -> dict[str, Path]:
-    """Return the mask of each photo by COLMAP's name. That of a.heic is named after it, not after its JPEG."""
-    found = job.found
+def _user_masks(job: Job, folder: Path) -> dict[str, Path]:
+    """Return the mask of each photo by COLMAP's name. The mask of a.heic is named after it, not after its JPEG."""
+    source = job.source
     own = {name: name for name in job.names}
-    own |= {name: found.files[name].relative_to(found.folder).as_posix() for name in found.converted}
+    own |= {name: source.files[name].relative_to(source.folder).as_posix() for name in source.converted}
     masks = find_masks(folder, list(own.values()))
     # The user's files: those beside HEIC and WebP photos are read from copies.
-    refuse_photos(masks, {photo: found.files.get(name, job.photos / name) for name, photo in own.items()})
+    refuse_photos(masks, {photo: source.files.get(name, job.photos / name) for name, photo in own.items()})
     return {name: masks[photo] for name, photo in own.items()}
 
 
 def read_sizes(job: Job, decode: bool = True) -> dict[str, tuple[int, int]]:
-    """Return width and height of each photo by name. `decode` finds damaged ones, before steps that take long."""
-
+    """Return width and height of each photo by name. `decode` finds damaged photos before long steps."""
     refused: dict[str, SceneError] = {}
 
     def size(name: str) -> tuple[int, int]:
@@ -94,10 +93,8 @@ def read_sizes(job: Job, decode: bool = True) -> dict[str, tuple[int, int]]:
         try:
             width, height = check_image(photo) if decode else image_size(photo)
             share = min(1.0, (job.settings.max_size or math.inf) / max(width, height))
-            pixels, subject = (
-                int(width * share) * int(height * share),
-                f"{photo}: the photo has {width}x{height} pixels",
-            )
+            pixels = int(width * share) * int(height * share)
+            subject = f"{photo}: the photo has {width}x{height} pixels"
             VIEW_PIXELS.check(pixels, subject, "choose a smaller --max-size", SceneError)
         except SceneError as error:
             refused[name] = error
@@ -111,7 +108,7 @@ def read_sizes(job: Job, decode: bool = True) -> dict[str, tuple[int, int]]:
     first = refused[names[0]]
     if len(names) == 1:
         raise first
-    raise SceneError(  # of all, so that a user need not find them one by one
+    raise SceneError(
         f"{len(names)} of {len(sizes)} photos cannot be used: {listed(names)}; the first: {first}"
     ) from first
 

@@ -34,14 +34,14 @@ class Job:
 
     Attributes:
         work: folder of unfinished work.
-        found: the photos, or the video.
+        source: the photos, or the video.
         settings: of the user.
         progress: show a bar for each step on stderr.
         seconds: wall time of each finished step by its title.
     """
 
     work: Path
-    found: Photos
+    source: Photos
     settings: PrepareSettings
     progress: bool
     seconds: dict[str, float] = field(default_factory=dict)
@@ -49,23 +49,23 @@ class Job:
     @property
     def photos(self) -> Path:
         """Folder of the photos that COLMAP reads."""
-        return self.work / "photos" if self.found.made else self.found.folder
+        return self.work / "photos" if self.source.needs_copies else self.source.folder
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the photos, once those of a video are there."""
-        if self.found.clip is None:
-            return tuple(self.found.files)
+        if self.source.clip is None:
+            return tuple(self.source.files)
         return tuple(sorted(file.name for file in self.photos.iterdir()))
 
     def photo(self, name: str) -> Path:
-        """Return the file of a photo: the user's, which errors should name, or what COLMAP reads instead."""
-        made = self.found.clip is not None or name in self.found.converted
-        return self.photos / name if made else self.found.files[name]
+        """Return the file of a photo: the user's, which errors should name, or the copy that COLMAP reads instead."""
+        is_copy = self.source.clip is not None or name in self.source.converted
+        return self.photos / name if is_copy else self.source.files[name]
 
     @property
     def masks(self) -> Path:
-        """Folder of the masks, which is missing without any."""
+        """Folder of the masks. It is missing without masks."""
         return self.work / MASKS
 
     @property
@@ -79,7 +79,7 @@ class Job:
         return self.work / "scene"
 
     def bar(self, title: str, unit: str) -> AbstractContextManager[ProgressCallback]:
-        """Show a bar if wanted; the function takes the number of finished items and their total."""
+        """Show a bar if wanted; yield the callback for finished items and their total."""
         return bar(title, unit, self.progress)
 
     @contextmanager
@@ -97,7 +97,7 @@ class Job:
 
 @contextmanager
 def opened_work(work: Path, settings: dict[str, Any], overwrite: bool) -> Iterator[None]:
-    """Make the work folder, or reuse that of the same photos and settings. A new one is removed if the block fails."""
+    """Make the work folder, or reuse one of the same photos and settings. A new one is removed if the block fails."""
     require_own_entries(work.parent, [work.name])
     file = work / "settings.json"
     if file.is_file():

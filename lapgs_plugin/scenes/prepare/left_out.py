@@ -1,4 +1,4 @@
-"""Tell why COLMAP could not place some photos, or not reliably, and what to try."""
+"""Explain photos that COLMAP could not place, and doubtful results, with advice."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ UNSURE = (
 )
 
 FEW_POINTS = 30
-"""Points for each placed photo below which the cameras rest on little; well-covered scenes have hundreds."""
+"""Fewest points per placed photo with reliable cameras. Well-covered scenes have hundreds."""
 
 
 def few_points(points: int, photos: int) -> str:
-    """Return what to do about a scene with so few points that its cameras may be wrong, else nothing."""
+    """Return advice about a scene with so few points that its cameras may be wrong, "" about another."""
     if points >= FEW_POINTS * photos:
         return ""
     return (
@@ -40,7 +40,7 @@ def few_points(points: int, photos: int) -> str:
 def left_out_because(
     database: Path, models: Sequence[pycolmap.Reconstruction], left_out: Sequence[str]
 ) -> dict[str, list[str]]:
-    """Return the names of photos without a place by the reason.
+    """Return the names of unplaced photos by the reason.
 
     Args:
         database: COLMAP's, with features and matches.

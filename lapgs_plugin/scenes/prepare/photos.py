@@ -1,4 +1,4 @@
-"""Find photos, make files that COLMAP reads of those that it does not, and tell which camera took them."""
+"""Find photos, convert those that COLMAP does not read, and identify their cameras by EXIF."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lapgs_plugin.scenes.masks import HEIC, has_photo_suffix
 SHOWN = 10
 """File names in a message, at most."""
 CONVERTED = (*HEIC, ".webp")
-"""Photos that COLMAP, as pycolmap brings it, does not read."""
+"""Photos that pycolmap does not read."""
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class Photos:
     converted: tuple[str, ...] = ()
 
     @property
-    def made(self) -> bool:
+    def needs_copies(self) -> bool:
         """Whether COLMAP cannot read the files where they are."""
         return self.clip is not None or bool(self.converted)
 
@@ -60,8 +60,8 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
     if source.is_file():
         return Photos(source.parent, {}, source)
     if not source.is_dir():
-        what = "a pipe, socket or device" if source.exists() else "no such folder of photos or video"
-        raise SceneError(f"{source}: {what}; give a folder of photos, or a video")
+        problem = "a pipe, socket or device" if source.exists() else "no such folder of photos or video"
+        raise SceneError(f"{source}: {problem}; give a folder of photos, or a video")
     aside = None if masks is None or masks.resolve() == source.resolve() else masks.resolve()
     entries = sorted(
         entry
@@ -73,37 +73,40 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
         logger.warning("links that lead nowhere, pipes or devices, left out: %s", listed(unreadable))
     chosen = [file for file in present if has_photo_suffix(file)]
     if heic := [file.name for file in chosen if _kind(file) in HEIC]:
-        what = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed(heic)})"
-        require_extra("pillow_heif", "heic", what, "convert them to JPEG")
+        subject = f"{source}: reading {counted(len(heic), 'HEIC photo')} ({listed(heic)})"
+        require_extra("pillow_heif", "heic", subject, "convert them to JPEG")
     others = sorted({file.suffix.lower() or file.name for file in present if not has_photo_suffix(file)})
     if len(chosen) < 2:
-        found = f" (and files of type {', '.join(others)})" if others else ""
+        more = f" (and files of type {', '.join(others)})" if others else ""
         raise SceneError(
-            f"{source}: {counted(len(chosen), 'photo')}{found}, expected at least 2, better 30, as "
+            f"{source}: {counted(len(chosen), 'photo')}{more}, expected at least 2, better 30, as "
             "JPEG, PNG, TIFF, BMP, WebP or HEIC; of a video give the file itself"
         )
     if others:
         left = [file.name for file in present if file not in chosen]
         logger.warning("not photos, left out: %s", listed(left))
     converted = {file for file in chosen if _kind(file) in CONVERTED}
-    places = [(file.relative_to(source), file) for file in chosen]
-    names = [(place.with_suffix(".jpg") if file in converted else place).as_posix() for place, file in places]
-    check_targets(source, list(zip(names, (place for place, _ in places), strict=True)))
+    originals = [file.relative_to(source) for file in chosen]
+    names = [
+        (original.with_suffix(".jpg") if file in converted else original).as_posix()
+        for original, file in zip(originals, chosen, strict=True)
+    ]
+    check_targets(source, list(zip(names, originals, strict=True)))
     files = dict(sorted(zip(names, chosen, strict=True)))
     return Photos(source, files, converted=tuple(name for name, file in files.items() if file in converted))
 
 
 def check_targets(source: Path, photos: Sequence[tuple[str, str | Path]]) -> None:
-    """Raise a SceneError if two of the photos, name and place of each, would have the same name in the scene."""
+    """Raise a SceneError if two photos, (name, original file name), would have the same name in the scene."""
     by_target: dict[str, str | Path] = {}
-    for name, place in photos:
-        if (other := by_target.setdefault(target_name(name), place)) != place:
-            raise SceneError(f"{source}: {other} and {place} would both become {target_name(name)}; rename one of them")
+    for name, file in photos:
+        if (other := by_target.setdefault(target_name(name), file)) != file:
+            raise SceneError(f"{source}: {other} and {file} would both become {target_name(name)}; rename one of them")
 
 
 def _kind(photo: Path) -> str:
     """Return the file type of a photo in lower case; phones and browsers name HEIC and WebP photos .jpg, too."""
-    with suppress(OSError), photo.open("rb") as stream:  # who reads the photo says why it cannot
+    with suppress(OSError), photo.open("rb") as stream:  # reading the photo will fail with a message
         start = stream.read(12)
         if start[4:8] == b"ftyp":
             return HEIC[0]

@@ -15,9 +15,9 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import option_values
 from lapgs_plugin.scenes.output import check_output, writing_explained
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
-from lapgs_plugin.scenes.prepare.given import Given, find_given, read_given
 from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
 from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
+from lapgs_plugin.scenes.prepare.known_cameras import KnownCameras, find_known_cameras, read_known_cameras
 from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
 from lapgs_plugin.scenes.prepare.photos import Photos, find_photos, listed
 from lapgs_plugin.scenes.prepare.placement import place_cameras
@@ -29,15 +29,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PrepareResult:
-    """The outcome of `prepare_scene`.
+    """Hold the outcome of `prepare_scene`.
 
     Attributes:
         registered: names of the photos that have a pose, sorted.
         left_out: names of the other photos, sorted.
         parts: number of separate models; the scene is the largest one.
         points: number of sparse points.
-        reprojection_error: mean reprojection error in pixels of the photos before undistortion; 0 if a model that was
-            given does not tell.
+        reprojection_error: mean in pixels of the photos before undistortion; 0 for an existing model without errors.
         seconds: wall time of each step by name, without the steps that an interrupted run had finished.
     """
 
@@ -82,17 +81,17 @@ def prepare_scene(
     pycolmap.logging.logtostderr = True  # and not to files in /tmp as well
     settings = settings or PrepareSettings()
     _check_folders(photos, out, settings, overwrite)
-    if (place := find_given(photos, settings)) is not None:
-        return _undistort(read_given(place, photos, settings), out, overwrite, progress)
+    if (folder := find_known_cameras(photos, settings)) is not None:
+        return _undistort(read_known_cameras(folder, photos, settings), out, overwrite, progress)
     require_colmap_for(settings)
-    found = find_photos(photos, settings.masks)
-    if settings.frames is not None and found.clip is None:
+    source = find_photos(photos, settings.masks)
+    if settings.frames is not None and source.clip is None:
         raise UserInputError(
             f"--frames {settings.frames}: it picks frames from a video, and {photos} is a folder; leave it out"
         )
     with writing_explained(out):
-        job = Job(out / WORK, found, settings, progress)
-        with opened_work(job.work, _identity(found, settings), overwrite):
+        job = Job(out / WORK, source, settings, progress)
+        with opened_work(job.work, _identity(source, settings), overwrite):
             make_photos(job)
             single_camera = one_camera(job, read_sizes(job))
             make_masks(job)
@@ -105,24 +104,23 @@ def prepare_scene(
     return result
 
 
-def _undistort(given: Given, out: Path, overwrite: bool, progress: bool) -> PrepareResult:
-    """Write the scene of a model that was there before."""
-    model, registered = given.model, tuple(frame.name for frame in given.frames)
+def _undistort(known: KnownCameras, out: Path, overwrite: bool, progress: bool) -> PrepareResult:
+    """Write the scene of an existing model."""
+    model, registered = known.model, tuple(frame.name for frame in known.frames)
     points, error = model.num_points3D(), model.compute_mean_reprojection_error()
     with writing_explained(out):
-        job = Job(out / WORK, given.photos, given.settings, progress)
-        with opened_work(job.work, _identity(given.photos, given.settings), overwrite):
-            given.check_sizes(read_sizes(job, decode=False))
+        job = Job(out / WORK, known.photos, known.settings, progress)
+        with opened_work(job.work, _identity(known.photos, known.settings), overwrite):
+            known.check_sizes(read_sizes(job, decode=False))
             make_masks(job)
             write_scene(job, model)
         move_into_place(job.work, out)
-    return PrepareResult(registered, given.left_out, 1, points, error, job.seconds)
+    return PrepareResult(registered, known.left_out, 1, points, error, job.seconds)
 
 
 def _check_folders(photos: Path, out: Path, settings: PrepareSettings, overwrite: bool) -> None:
-    source, target = (
-        Path(os.path.realpath(path)) for path in (photos, out)
-    )  # Path.resolve raises for a link to itself
+    # Path.resolve raises for a link to itself.
+    source, target = (Path(os.path.realpath(path)) for path in (photos, out))
     if source.is_relative_to(target) or target.is_relative_to(source):
         raise UserInputError(f"{out}: one of {photos} and {out} lies in the other; write OUT somewhere else")
     check_output(out, overwrite, WORK)
@@ -130,9 +128,9 @@ def _check_folders(photos: Path, out: Path, settings: PrepareSettings, overwrite
         raise UserInputError(f"--masks {settings.masks}: no such folder of masks; leave it out to use the whole photos")
 
 
-def _identity(found: Photos, settings: PrepareSettings) -> dict[str, Any]:
-    """Return what unfinished work must agree with to be continued, as JSON: the files, the options, the version."""
-    files = {found.clip.name: found.clip} if found.clip is not None else found.files
+def _identity(source: Photos, settings: PrepareSettings) -> dict[str, Any]:
+    """Return files, options and version, as JSON, which must be equal for unfinished work to be continued."""
+    files = {source.clip.name: source.clip} if source.clip is not None else source.files
     stats = {name: path.stat() for name, path in files.items()}
     options = {
         f"--{name.replace('_', '-')}": str(value.absolute()) if isinstance(value, Path) else value
@@ -153,7 +151,7 @@ def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRes
         logger.warning("%d of %d photos could not be placed: %s", len(left_out), len(job.names), listed(left_out))
         for reason, names in left_out_because(job.database, models, left_out).items():
             logger.warning("%s: %s", listed(names), reason)
-        if chosen_matcher(job) == SEQUENTIAL and job.found.clip is None:
+        if chosen_matcher(job) == SEQUENTIAL and job.source.clip is None:
             logger.warning("--matcher sequential compares neighbours by name; try --matcher exhaustive")
     if warning := few_points(best.num_points3D(), len(registered)):
         logger.warning(warning)

@@ -24,24 +24,26 @@ from lapgs_plugin.scenes.prepare.view_graph import (
 SIMPLE_MODEL = "SIMPLE_RADIAL"
 """Camera model that is fitted if the result with the first one is doubtful."""
 FEW = 0.75
-"""Share of photos below which so few are placed that another attempt may place more."""
+"""Share of placed photos below which another attempt may place more."""
 SQUARE = 0.04
-"""Largest relative difference of the focal lengths along x and y that is believed: pixels are square."""
-EXACT, INEXACT = 0.1, 1.0
-"""Reprojection errors in pixels: no feature is found better than the first; above the second the lens is doubtful."""
+"""Largest plausible relative difference of the focal lengths along x and y, because pixels are square."""
+EXACT = 0.1
+"""Reprojection error in pixels with which features are found at best."""
+INEXACT = 1.0
+"""Reprojection error in pixels above which the lens is doubtful."""
 SAME_ERROR = 1.02
-"""Ratio of reprojection errors up to which they are the same: a lens with fewer parameters fits noise less."""
+"""Ratio of equal reprojection errors, because a lens with more parameters fits more of the noise."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Hold the models of an attempt and what was wrong with them.
+    """Hold the models of an attempt and their seams.
 
     Attributes:
-        models: the one with most photos first, without photos whose place is arbitrary.
-        seams: where a model was cut, a sentence each.
+        models: the one with most photos first, without unlinked photos.
+        seams: a sentence for each cut of a model.
     """
 
     models: list[pycolmap.Reconstruction]
@@ -67,8 +69,8 @@ class Placement:
 def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
     """Recover the models and return them, the one with most photos first.
 
-    If the default camera model places few photos, gives focal lengths that no lens has, or glues groups of photos
-    together, place the cameras again with a simpler one.
+    If the default camera model places few photos, gives focal lengths that no lens has, or joins groups of photos
+    wrongly, the cameras are placed again with a simpler model.
 
     Raises:
         SceneError: no photo could be placed.
@@ -81,7 +83,7 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
             placement = _placed_again(job, placement, doubt)
     if placement.photos < 2:
         raise SceneError(
-            f"{job.found.clip or job.found.folder}: none of the {len(job.names)} photos could be placed; expected "
+            f"{job.source.clip or job.source.folder}: none of the {len(job.names)} photos could be placed; expected "
             "sharp photos of a static scene that overlap strongly, each taken a step aside from the last"
         )
     for seam in placement.seams:
@@ -89,16 +91,16 @@ def place_cameras(job: Job) -> list[pycolmap.Reconstruction]:
     best = placement.models[0]
     turns = _quarter_turns(job)
     if rolled := rolled_images(best, lambda name: turns[name] or 0):
+        names = listed(sorted(best.images[key].name for key in rolled))
         logger.warning(
-            "%d of %d photos are rolled by more than %.0f degrees against the others: %s; if they were taken upright, "
-            "their places are wrong: look at the result with care",
-            *(len(rolled), placement.photos, ROLLED, listed(sorted(best.images[key].name for key in rolled))),
+            f"{len(rolled)} of {placement.photos} photos are rolled by more than {ROLLED:.0f} degrees against the "
+            f"others: {names}; if they were taken upright, their places are wrong: look at the result with care"
         )
     return placement.models
 
 
 def _placed_again(job: Job, first: Placement, doubt: str) -> Placement:
-    """Return the best of a doubtful placement, that of a simpler lens, and if few are placed, of further attempts."""
+    """Return the best of a doubtful placement, one with a simpler lens, and further ones if few photos are placed."""
     logger.info("%s; placing the cameras again with a simpler lens", doubt)
     again = _placed(job, Attempt("Placing again", "models_simple", SIMPLE_MODEL))
     simpler = again.photos == first.photos and again.error <= SAME_ERROR * first.error
@@ -107,9 +109,9 @@ def _placed_again(job: Job, first: Placement, doubt: str) -> Placement:
         return _with_more_matches(job, best)
     if best is not again:
         logger.warning(
-            "a simpler lens places %d of %d photos with an error of %.2f pixels, not %d with %.2f; %s: look at the "
-            "result with care, or take more photos from other heights and distances",
-            *(again.photos, len(job.names), again.error, first.photos, first.error, doubt),
+            f"a simpler lens places {again.photos} of {len(job.names)} photos with an error of {again.error:.2f} "
+            f"pixels, not {first.photos} with {first.error:.2f}; {doubt}: look at the result with care, or take more "
+            "photos from other heights and distances"
         )
     return best
 
@@ -126,7 +128,7 @@ def _with_more_matches(job: Job, best: Placement) -> Placement:
 
 
 def _placed(job: Job, attempt: Attempt) -> Placement:
-    """Return what an attempt places, cut where groups of photos are glued together."""
+    """Return the placement of an attempt, cut where groups of photos are wrongly joined."""
     models, seams, turns = map_photos(job, attempt), [], _quarter_turns(job)
     held_upright = None not in turns.values()
     for model in models:  # and the parts that are cut off
@@ -158,12 +160,12 @@ def _quarter_turns(job: Job) -> dict[str, int | None]:
 
 
 def _few(job: Job, placement: Placement) -> bool:
-    """Return whether so few photos are placed that another attempt may place more."""
+    """Return whether less than a share `FEW` of the photos is placed."""
     return placement.photos < FEW * len(job.names)
 
 
 def _doubt(job: Job, placement: Placement) -> str | None:
-    """Return why the models may be wrong because the lens was not found; None if nothing says so."""
+    """Return the evidence of a wrong lens; None without any."""
     if placement.seams:
         return placement.seams[0]
     if _few(job, placement):

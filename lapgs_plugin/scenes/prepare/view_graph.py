@@ -1,4 +1,4 @@
-"""Judge how placed photos hang together: by the points that they share, and by where their up points."""
+"""Judge the consistency of placed photos by the points that they share and by their verticals."""
 
 from __future__ import annotations
 
@@ -15,40 +15,41 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from lapgs_plugin.scenes.prepare.undistort import QUARTER_TURN
 
 LINKED = 15
-"""Fewest points that two photos share if one's place says where the other is, as in COLMAP's mapper."""
-WEAK, WEAK_IF_TURNED = 0.2, 0.4
-"""Share of a photo's strongest link within its group below which a link between groups is weak, without more evidence
-and if the groups have different verticals. Links of photos taken step by step are alike; wrong ones are of the few
-features that happen to agree."""
+"""Fewest shared points that link two photos, as in COLMAP's mapper."""
+WEAK = 0.2
+"""Strength of a weak link between groups, as a share of its photos' strongest link within their groups. Links of photos
+taken step by step are equally strong; wrong links consist of the few features that agree by chance."""
+WEAK_IF_TURNED = 0.4
+"""Strength of a weak link between groups with different verticals, in the same unit."""
 GROUP = 3
 """Fewest photos of a group. Fewer have too few links of their own to compare with."""
 HELD = 30
-"""Points by which two groups at least hang together: COLMAP's mapper asks as many for the place of a single photo."""
+"""Fewest shared points that join two groups. COLMAP's mapper requires as many to place a single photo."""
 TURNED = 45.0
-"""Angle in degrees between the verticals of two groups of upright photos from which one of them is wrong. That of a few
-photos of one direction is known to about 30 degrees, by how much a hand tilts a phone."""
+"""Least angle in degrees between contradicting verticals of two upright groups. The vertical of a few photos of one
+direction is known to about 30 degrees, because a hand tilts a phone so much."""
 UPRIGHT = 30.0
-"""Roll in degrees within which a photo is upright."""
+"""Largest roll in degrees of an upright photo."""
 ROLLED = 60.0
-"""Roll in degrees from which a photo is clearly not upright."""
+"""Least roll in degrees of a photo that is clearly not upright."""
 MOSTLY = 0.8
-"""Share of upright photos in a group from which it says where up is."""
+"""Least share of upright photos in a group with a vertical."""
 FEW_ROLLED = 0.1
-"""Share of rolled photos up to which nothing is said, because people turn a phone now and then."""
+"""Largest share of rolled photos without a warning, because people turn a phone now and then."""
 STEEP = 0.5
-"""Sine of the angle to the vertical within which a view is so steep that its roll says nothing: drones, table tops."""
+"""Sine of the angle to the vertical below which a view has no usable roll, as of drones and table tops."""
 NARROW = 0.9
-"""Length of the mean of the unit view directions from which all look into one direction. Turning about it is no roll if
-it points down, as that of a drone."""
+"""Length of the mean of the unit view directions above which all photos look into one direction. Rotation about a
+direction that points down, as of a drone, is no roll."""
 TRIED = 60
 """Most photos whose up is tried as the vertical."""
 LEVEL = 0.03
-"""Weight of the assumption that photos look straight ahead, which decides only where all look into one direction."""
+"""Weight of the assumption that photos look horizontally. It decides only where all look into one direction."""
 
 
 @dataclass(frozen=True)
 class Seam:
-    """Two groups of photos that hang together so weakly that their places towards each other are wrong.
+    """Two groups of photos that are joined so weakly that their relative pose is wrong.
 
     Attributes:
         apart: the images of the smaller group.
@@ -180,8 +181,13 @@ def _strongest_within(shared: csr_array, one: int, other: int, apart: NDArray[np
 
 
 class _Turn(NamedTuple):
-    """The angle in degrees between the verticals of two groups, the number of photos that are upright to their own, and
-    whether one group may only have been rolled."""
+    """The rotation of two groups against each other.
+
+    Attributes:
+        angle: between their verticals in degrees.
+        upright: number of photos that are upright to the vertical of their group.
+        perhaps_rolled: whether one group may only have been rolled.
+    """
 
     angle: float
     upright: int

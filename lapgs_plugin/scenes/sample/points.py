@@ -46,11 +46,11 @@ def sample_points(world: World, cameras: Sequence[Camera], count: int, seed: int
     """
     random = np.random.default_rng([seed, 3])
     parts: list[SparsePoints] = []
-    while (found := sum(len(part.positions) for part in parts)) < count:
+    while (visible := sum(len(part.positions) for part in parts)) < count:
         if len(parts) == ROUNDS:
             raise UserInputError(
-                f"--points {count}: found only {found} that two of {len(cameras)} views see, expected fewer points or "
-                "more --views"
+                f"--points {count}: found only {visible} that two of {len(cameras)} views see, expected fewer points "
+                "or more --views"
             )
         parts.append(_sample_batch(world, cameras, max(256, count + count // 8), random))
     return SparsePoints(*(np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True)))

@@ -12,8 +12,10 @@ from lapgs_plugin.scenes.sample.ray_kernels import nearest_hits
 from lapgs_plugin.scenes.sample.solids import Floats, Solid, dot, rotate
 from lapgs_plugin.scenes.sample.world import PALETTE
 
-SAMPLES, SKEW = 8, 3
+SAMPLES = 8
 """Rays a pixel, in a lattice with one point in each row and each column, the same in every pixel."""
+SKEW = 3
+"""Columns from a row's point of the lattice to the next row's, modulo `SAMPLES`."""
 BLOCK = 40
 """Side in pixels of the blocks traced at once, whose arrays fit into the cache of a core and are below the size from
 which malloc asks the system for new pages each time."""

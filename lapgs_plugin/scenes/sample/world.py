@@ -199,7 +199,7 @@ def _globe_paint(random: np.random.Generator) -> Paint:
     """Paint continents under a net of meridians and parallels."""
     waves = random.normal(size=(9, 3)) * np.geomspace(2.0, 9.0, 9)[:, None]
     weights, phases = 1 / np.linalg.norm(waves, axis=1) ** 0.8, random.uniform(0, 2 * np.pi, 9)
-    series = list(zip(*(each.astype(np.float32) for each in (waves, weights, phases)), strict=True))
+    series = list(zip(*(array.astype(np.float32) for array in (waves, weights, phases)), strict=True))
 
     def paint(points: Floats, normals: Floats) -> Codes:
         height = sum((np.sin(dot(wave, normals) + phase) * weight for wave, weight, phase in series), 0)

@@ -20,11 +20,14 @@ import pycolmap
 
 SEED = 0
 
-MOST_DESCRIPTORS, DESCRIPTORS_A_WORD = 65_536, 50
+MOST_DESCRIPTORS = 65_536
+"""Most features that a vocabulary is made of."""
+DESCRIPTORS_A_WORD = 50
 FEWEST_WORDS, MOST_WORDS = 64, 1024
-EMBEDDING, ROUNDS = 64, 6
-"""Features that a vocabulary is made of, its size, and the rounds of clustering, which take seconds and show nothing;
-the embedding is the only one that COLMAP has for SIFT."""
+EMBEDDING = 64
+"""Dimensions of an embedding, the only number that COLMAP has for SIFT."""
+ROUNDS = 6
+"""Rounds of clustering, which take seconds without showing progress."""
 
 PAIRS_A_THREAD = 4
 """Pairs that a thread matches between two moves of the progress bar: COLMAP saves the pairs of a block together."""
@@ -94,11 +97,11 @@ def _match_pairs(job: dict[str, Any]) -> None:
 def _make_tree(database: str, tree: str) -> None:
     """Write a vocabulary of the photos' own features, which finds photos that look alike. Nothing is downloaded."""
     with pycolmap.Database.open(database) as opened:
-        kinds = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
-    used = [each for each in kinds if len(each.data)]
-    share = min(1.0, MOST_DESCRIPTORS / max(sum(len(each.data) for each in used), 1))
+        by_image = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
+    used = [image for image in by_image if len(image.data)]
+    share = min(1.0, MOST_DESCRIPTORS / max(sum(len(image.data) for image in used), 1))
     random = np.random.default_rng(SEED)
-    chosen = [each.data[random.random(len(each.data)) < share] for each in used]
+    chosen = [image.data[random.random(len(image.data)) < share] for image in used]
     descriptors = np.concatenate(chosen).astype(np.float32)
     words = int(np.clip(len(descriptors) // DESCRIPTORS_A_WORD, FEWEST_WORDS, MOST_WORDS))
     index = pycolmap.VisualIndex.create(descriptors.shape[1], EMBEDDING)
@@ -132,13 +135,16 @@ def _map(job: dict[str, Any]) -> None:
         options.num_threads = 1
     with Path(job["placed"]).open("wb", buffering=0) as placed:
 
-        def place(photos: bytes) -> None:
+        def record(photos: bytes) -> None:
             placed.write(photos)
 
         pycolmap.incremental_mapping(
-            *(job["database"], job["photos"], job["models"], options),
-            initial_image_pair_callback=lambda: place(b"\n.."),
-            next_image_callback=lambda: place(b"."),
+            job["database"],
+            job["photos"],
+            job["models"],
+            options,
+            initial_image_pair_callback=lambda: record(b"\n.."),
+            next_image_callback=lambda: record(b"."),
         )
 
 

@@ -1,4 +1,4 @@
-"""Take the cameras of a model that is there, of COLMAP or in a transforms file, so that photos are only undistorted."""
+"""Take the cameras of an existing COLMAP model or transforms file, so that photos are only undistorted."""
 
 from __future__ import annotations
 
@@ -36,26 +36,29 @@ from lapgs_plugin.scenes.scene import check_shape, check_source
 from lapgs_plugin.scenes.source import ALL_AROUND, ALL_AROUND_HINT, PINHOLE_MODELS, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
-"""Where the photos of these models are."""
+"""Folders in which the photos of a model may be."""
 USED = ("max_size", "masks", "model")
 """Settings that concern undistortion."""
+STRAIGHT = {"PINHOLE", "SIMPLE_PINHOLE"}
+"""Camera models without distortion."""
 OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3")
+"""Distortion of perspective lenses in transforms files. Their k4 is nerfstudio's, not OpenCV's."""
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
-"""Distortion in transforms files. nerfstudio's k4 of other lenses is not OpenCV's."""
+"""Distortion of fisheye lenses in transforms files."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Given:
+class KnownCameras:
     """Hold a model and its photos.
 
     Attributes:
-        model: with poses of the photos that are there.
-        frames: these photos, with pinhole cameras of the model's size.
-        photos: their files.
-        left_out: names of the model's other photos, sorted.
-        settings: the user's, with the model and the masks that were found.
+        model: with poses of the present photos.
+        frames: of the present photos, with pinhole cameras of the model's size.
+        photos: the present files.
+        left_out: names of the model's missing photos, sorted.
+        settings: the user's, completed by the model and the masks.
     """
 
     model: pycolmap.Reconstruction
@@ -78,10 +81,10 @@ class Given:
                 )
 
 
-def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
+def find_known_cameras(photos: Path, settings: PrepareSettings) -> Path | None:
     """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
 
-    It is what `lapgs train` reads, if it can be trained on. Of several distorted models the largest is taken.
+    An undistorted model is the one that `lapgs train` reads. Of several distorted models the largest is taken.
 
     Raises:
         UserInputError: --model names none.
@@ -101,76 +104,83 @@ def find_given(photos: Path, settings: PrepareSettings) -> Path | None:
         for line in larger_model(photos, trained):
             logger.warning(line)
         return trained
-    found = trained or find_model(photos, MODEL_PLACES)
-    return None if found is None else largest_model(photos, found)
+    distorted = trained or find_model(photos, MODEL_PLACES)
+    return None if distorted is None else largest_model(photos, distorted)
 
 
-def read_given(place: Path, photos: Path, settings: PrepareSettings) -> Given:
+def read_known_cameras(cameras: Path, photos: Path, settings: PrepareSettings) -> KnownCameras:
     """Read a model and find its photos.
 
     Args:
-        place: from `find_given`.
+        cameras: from `find_known_cameras`.
         photos: folder of the photos, or of the whole scene.
         settings: of the user.
 
     Raises:
         SceneError: the model cannot be read or undistorted, or its photos are not there.
-        UserInputError: nothing is distorted, or an option is about the search for cameras.
+        UserInputError: no camera is distorted, or an option is about the search for cameras.
     """
     for field in fields(settings):
         if field.name not in USED and getattr(settings, field.name) != field.default:
             raise UserInputError(
-                f"{option_name(field)}: {place} has the cameras already; leave the option out, or give a folder of "
+                f"{option_name(field)}: {cameras} has the cameras already; leave the option out, or give a folder of "
                 "photos without a model"
             )
-    transforms = find_model(place, (".",)) is None
-    if not transforms:
-        model = read_model(place, observations=True)
-        _check_lenses(model)
-        choices = [(with_bare_names(model, photos / name), photos / name) for name in FOLDERS]
-        model, folder = max(choices, key=lambda choice: _fit(source_of(*choice)))
-        source = source_of(model, folder)
-        frames = list(source.train)
-    else:
-        lenses: Lenses = {}
-        source, folder = read_transforms(photos, "images", False, lenses), photos
-        top = common_folder([frame.name for frame in source.train])
-        frames = [replace(frame, name=frame.name.removeprefix(top)) for frame in source.train]
-        model = _model_of(place, replace(source, train=tuple(frames)), lenses)
-        other = find_model(photos, MODEL_PLACES)
-        if other is not None and (count := count_images(other)) != len(frames):
-            logger.warning(
-                "%s lists %d photos and %s %d; those of the former are used, as by `lapgs train`; --model %s takes the "
-                "latter",
-                *(photos / SINGLE_FILE, len(frames), other, count, quote(str(other))),
-            )
-        _check_lenses(model)
-    there = tuple(frame for frame in frames if is_file(frame.path))
-    left_out = sorted({frame.name for frame in frames} - {frame.name for frame in there})
-    if frames and not there:
+    transforms = find_model(cameras, (".",)) is None
+    model, source, folder = (_from_transforms if transforms else _from_model)(cameras, photos)
+    _check_lenses(model)
+    frames = source.train
+    present = tuple(frame for frame in frames if is_file(frame.path))
+    left_out = sorted({frame.name for frame in frames} - {frame.name for frame in present})
+    if frames and not present:
         advice = "put them there" if transforms else "give the folder of the photos, and the model with --model"
         first = min(frame.path for frame in frames)
-        raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {place}; {advice}")
-    kinds = {model.cameras[image.camera_id].model.name for image in model.images.values()}
-    as_it_is = (transforms or place == find_model(photos)) and not left_out and kinds <= {"PINHOLE", "SIMPLE_PINHOLE"}
-    if settings.max_size is None and as_it_is:
+        raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {cameras}; {advice}")
+    straight = {model.cameras[image.camera_id].model.name for image in model.images.values()} <= STRAIGHT
+    if settings.max_size is None and straight and not left_out and (transforms or cameras == find_model(photos)):
         raise UserInputError(
-            f"{place}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
+            f"{cameras}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
             "cameras again, give a folder of photos without a model"
         )
-    check_source(photos, replace(source, train=there))
-    check_targets(photos, [(frame.name, frame.name) for frame in there])
+    check_source(photos, replace(source, train=present))
+    check_targets(photos, [(frame.name, frame.name) for frame in present])
     for warning in source.warnings:
         logger.warning(warning)
     if left_out:
         logger.warning("%d of %d photos are not there, left out: %s", len(left_out), len(frames), listed(left_out))
-    logger.info("%s: the cameras are taken from it", place)
+    logger.info("%s: the cameras are taken from it", cameras)
     masks = settings.masks
-    if masks is None and (found := resolve_masks(photos, AUTO)) != NONE:
-        masks = photos / found
-    files = {frame.name: frame.path for frame in there}
-    settings = replace(settings, masks=masks, model=place)
-    return Given(_reconstruction(model, files), there, Photos(folder, files), tuple(left_out), settings)
+    if masks is None and (masks_setting := resolve_masks(photos, AUTO)) != NONE:
+        masks = photos / masks_setting
+    files = {frame.name: frame.path for frame in present}
+    settings = replace(settings, masks=masks, model=cameras)
+    return KnownCameras(_reconstruction(model, files), present, Photos(folder, files), tuple(left_out), settings)
+
+
+def _from_model(cameras: Path, photos: Path) -> tuple[Model, SceneSource, Path]:
+    """Return a COLMAP model, its frames and points, and the folder that most of its photos are in."""
+    model = read_model(cameras, observations=True)
+    _check_lenses(model)
+    choices = [(with_bare_names(model, photos / name), photos / name) for name in FOLDERS]
+    model, folder = max(choices, key=lambda choice: _fit(source_of(*choice)))
+    return model, source_of(model, folder), folder
+
+
+def _from_transforms(cameras: Path, photos: Path) -> tuple[Model, SceneSource, Path]:
+    """Return a model of a transforms file, its frames and points, and the folder of its photos."""
+    lenses: Lenses = {}
+    source = read_transforms(photos, "images", False, lenses)
+    top = common_folder([frame.name for frame in source.train])
+    frames = tuple(replace(frame, name=frame.name.removeprefix(top)) for frame in source.train)
+    source = replace(source, train=frames)
+    model = _model_of(cameras, source, lenses)
+    other = find_model(photos, MODEL_PLACES)
+    if other is not None and (count := count_images(other)) != len(frames):
+        logger.warning(
+            f"{photos / SINGLE_FILE} lists {len(frames)} photos and {other} {count}; those of the former are used, as "
+            f"by `lapgs train`; --model {quote(str(other))} takes the latter"
+        )
+    return model, source, photos
 
 
 def _fit(source: SceneSource) -> tuple[int, bool]:
@@ -178,21 +188,21 @@ def _fit(source: SceneSource) -> tuple[int, bool]:
 
     3DGS's convert.py leaves photos in `input` and undistorted ones, which may have the same shape, in `images`.
     """
-    there = [frame for frame in source.train if is_file(frame.path)]
-    return len(there), any(image_size(frame.path) == frame.camera.size for frame in there[:1])
+    present = [frame for frame in source.train if is_file(frame.path)]
+    return len(present), any(image_size(frame.path) == frame.camera.size for frame in present[:1])
 
 
 def _check_lenses(model: Model) -> None:
     for key in sorted({image.camera_id for image in model.images.values()}):
         camera = model.cameras[key]
-        who = f"{model.folder}: camera {key} ({camera.model.name})"
+        subject = f"{model.folder}: camera {key} ({camera.model.name})"
         if camera.model.name == ALL_AROUND:
-            raise SceneError(f"{who}: {ALL_AROUND_HINT}")
+            raise SceneError(f"{subject}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
-            raise SceneError(f"{who} has NaN or inf in its parameters; reconstruct or export it again")
+            raise SceneError(f"{subject} has NaN or inf in its parameters; reconstruct or export it again")
 
 
-def _model_of(place: Path, source: SceneSource, lenses: Lenses) -> Model:
+def _model_of(folder: Path, source: SceneSource, lenses: Lenses) -> Model:
     """Return frames and points of a transforms file as a model of COLMAP."""
     cameras: dict[str, pycolmap.Camera] = {}
     images: dict[int, PosedImage] = {}
@@ -207,7 +217,7 @@ def _model_of(place: Path, source: SceneSource, lenses: Lenses) -> Model:
         x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
         images[number] = PosedImage(frame.name, key, np.array([w, x, y, z, *pose[:3, 3]]), NO_FEATURES)
     by_id = {camera.camera_id: camera for camera in cameras.values()}
-    return Model(place, by_id, images, Points(source.points, 255.0 * source.colors))
+    return Model(folder, by_id, images, Points(source.points, 255.0 * source.colors))
 
 
 def _reconstruction(model: Model, names: Collection[str]) -> pycolmap.Reconstruction:
