@@ -11,10 +11,10 @@ def main() -> None:
     import gc
     import os
 
-    # Importing torch makes a million objects, none of them garbage; by default Python looks for it all the while, which
-    # takes a tenth of the time until a command begins.
+    # Importing torch makes a million objects and no garbage. Collections would take a tenth of the time until a command
+    # begins.
     gc.set_threshold(10_000)
-    # Before torch starts its threads: they must not spin on the cores that our kernels need (reference_raster.threads).
+    # Before torch starts its threads: they must not spin on the cores that our kernels need (jit.threads).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from lapgs_plugin.cli.app import run
 

@@ -36,7 +36,7 @@ INSTALLED: Registry[typer.Typer] = Registry("lapgs", "lapgs.commands", typer.Typ
 
 
 class InstalledCommand(TyperCommand):
-    """A command of an entry point. Its package is imported when it is called; `lapgs --help` reads its source."""
+    """Import a command of an entry point when it is called. `lapgs --help` only reads its source."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, help=module_summary(INSTALLED.entries[name].module))
@@ -66,7 +66,7 @@ class InstalledCommand(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """Run a command so that signals end it as `lapgs_plugin.interrupt` says and usage errors are one line."""
+    """Run a command so that a signal ends it as in `lapgs_plugin.interrupt`, and usage errors are one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Make commands from dataclasses whose fields are declared as options (`lapgs_plugin.options`)."""
+"""Make commands from dataclasses whose fields are declared as options, see `lapgs_plugin.options`."""
 
 from __future__ import annotations
 
@@ -21,28 +21,27 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 def takes_settings(command: _F) -> _F:
     """Replace the parameters of a command that are settings dataclasses by the options that their fields declare.
 
-    `--help` lists them in the order of the command's parameters. The command is called with an instance, which checks
-    its values when it is made. Fields without a declaration keep their defaults, unless they are settings dataclasses
-    themselves: these add their options. A field declared with `options.options_of` adds the options of everything that
-    can be chosen there, at the end.
+    `--help` lists them in the order of the command's parameters. The command is called with instances, which check
+    their values. Fields without a declaration keep their defaults. Nested settings dataclasses add their options. A
+    field declared with `options.options_of` adds the options of all choices, at the end.
     """
     signature = inspect.signature(command, eval_str=True)
-    settings = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
+    kinds = {name: one.annotation for name, one in signature.parameters.items() if is_dataclass(one.annotation)}
     own: list[inspect.Parameter] = []
-    for name, each in signature.parameters.items():
-        own.extend(_parameters(settings[name]) if name in settings else [each])
-    added, clashes = _chosen_parameters(settings.values(), {each.name for each in own})
+    for name, parameter in signature.parameters.items():
+        own.extend(_parameters(kinds[name]) if name in kinds else [parameter])
+    added, clashes = _chosen_parameters(kinds.values(), {parameter.name for parameter in own})
 
     @functools.wraps(command)
-    def call(**given: Any) -> Any:
+    def call(**arguments: Any) -> Any:
         if clashes:
             raise UserInputError(f"{clashes[0]}; fix or uninstall the package that brings it")
-        made = {name: _build(kind, given) for name, kind in settings.items()}
-        return command(**given, **made)
+        settings = {name: _build(kind, arguments) for name, kind in kinds.items()}
+        return command(**arguments, **settings)
 
-    keyword_only = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *added)]
+    keyword_only = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in (*own, *added)]
     call.__signature__ = signature.replace(parameters=keyword_only)  # type: ignore[attr-defined]  # typer reads it
-    call.__annotations__ = {each.name: each.annotation for each in keyword_only}
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in keyword_only}
     result: Any = call
     return result  # type: ignore[no-any-return]  # another signature
 
@@ -50,22 +49,22 @@ def takes_settings(command: _F) -> _F:
 def _declared(kind: Any) -> Iterator[tuple[Field[Any], Any, Option | None]]:
     """Yield the fields of a dataclass with their types and declarations."""
     hints = get_type_hints(kind)
-    for each in fields(kind):
-        yield each, hints[each.name], each.metadata.get(KEY)
+    for field in fields(kind):
+        yield field, hints[field.name], field.metadata.get(KEY)
 
 
 def _parameters(kind: Any) -> Iterator[inspect.Parameter]:
     """Make the parameters of a settings dataclass and those inside it."""
-    for each, hint, declared in _declared(kind):
+    for field, hint, declared in _declared(kind):
         if declared is not None:
-            default = each.default_factory() if each.default_factory is not MISSING else each.default
-            yield _parameter(each, hint, declared, default)
-        elif is_dataclass(hint) and CHOSEN not in each.metadata:
+            default = field.default_factory() if field.default_factory is not MISSING else field.default
+            yield _parameter(field, hint, declared, default)
+        elif is_dataclass(hint) and CHOSEN not in field.metadata:
             yield from _parameters(hint)
 
 
-def _parameter(each: Field[Any], hint: Any, declared: Option, default: Any) -> inspect.Parameter:
-    name = parameter_name(each.name, declared)
+def _parameter(field: Field[Any], hint: Any, declared: Option, default: Any) -> inspect.Parameter:
+    name = parameter_name(field.name, declared)
     names = declared.names or ((f"--{name.replace('_', '-')}",) if hint is bool else ())
     asked = typer.Option(
         *names,
@@ -79,58 +78,58 @@ def _parameter(each: Field[Any], hint: Any, declared: Option, default: Any) -> i
 
 
 def _chosen_parameters(kinds: Iterable[Any], taken: set[str]) -> tuple[list[inspect.Parameter], list[str]]:
-    """Make the parameters of everything that an option can choose, and say which have the name of another.
+    """Return the parameters of all choices of options, and a line for each that has the name of another.
 
     An option that one choice inherits from another is the same for both.
     """
-    found: dict[str, tuple[Option, inspect.Parameter]] = {}
+    chosen: dict[str, tuple[Option, inspect.Parameter]] = {}
     clashes = []
-    for registry, by in (chosen for kind in kinds for chosen in _registries(kind)):
+    for registry, by in (pair for kind in kinds for pair in _registries(kind)):
         for choice, settings in _choices(registry).items():
-            for each, hint, declared in _declared(type(settings)):
+            for field, hint, declared in _declared(type(settings)):
                 if declared is None:
                     continue
-                name = parameter_name(each.name, declared)
-                if name in taken or (name in found and found[name][0] is not declared):
-                    clashes.append(f"--{by} {choice}: {option_name(each)} is also an option of something else")
-                found.setdefault(name, (declared, _parameter(each, hint, declared, getattr(settings, each.name))))
-    return [parameter for name, (_, parameter) in found.items() if name not in taken], clashes
+                name = parameter_name(field.name, declared)
+                if name in taken or (name in chosen and chosen[name][0] is not declared):
+                    clashes.append(f"--{by} {choice}: {option_name(field)} is also an option of something else")
+                chosen.setdefault(name, (declared, _parameter(field, hint, declared, getattr(settings, field.name))))
+    return [parameter for name, (_, parameter) in chosen.items() if name not in taken], clashes
 
 
 def _registries(kind: Any) -> Iterator[tuple[Registry[Any], str]]:
-    """Find what `options.options_of` declares in a settings dataclass and those inside it."""
-    for each, hint, declared in _declared(kind):
-        if CHOSEN in each.metadata:
-            yield each.metadata[CHOSEN]
+    """Yield the declarations by `options.options_of` in a settings dataclass and those inside it."""
+    for field, hint, declared in _declared(kind):
+        if CHOSEN in field.metadata:
+            yield field.metadata[CHOSEN]
         elif declared is None and is_dataclass(hint):
             yield from _registries(hint)
 
 
 def _choices(registry: Registry[Any]) -> dict[str, Any]:
     """Return the settings objects of a registry. One that cannot be loaded is an error only where it is chosen."""
-    found = {}
+    choices = {}
     for name in registry:
         with suppress(UserInputError):
-            found[name] = registry[name]
-    return found
+            choices[name] = registry[name]
+    return choices
 
 
-def _build(kind: Any, given: dict[str, Any]) -> Any:
-    """Make an instance from a command's arguments, and remove these from `given`."""
+def _build(kind: Any, arguments: dict[str, Any]) -> Any:
+    """Make an instance from a command's arguments, and remove these from `arguments`."""
     values: dict[str, Any] = {}
-    for each, hint, declared in _declared(kind):
+    for field, hint, declared in _declared(kind):
         if declared is not None:
-            values[each.name] = given.pop(parameter_name(each.name, declared))
-        elif CHOSEN in each.metadata:
-            registry, by = each.metadata[CHOSEN]
-            values[each.name] = _build_chosen(registry, by, values[by], given)
+            values[field.name] = arguments.pop(parameter_name(field.name, declared))
+        elif CHOSEN in field.metadata:
+            registry, by = field.metadata[CHOSEN]
+            values[field.name] = _build_chosen(registry, by, values[by], arguments)
         elif is_dataclass(hint):
-            values[each.name] = _build(hint, given)
+            values[field.name] = _build(hint, arguments)
     return kind(**values)
 
 
-def _build_chosen(registry: Registry[Any], by: str, name: str, given: dict[str, Any]) -> Any:
-    """Make the settings object of a choice, and take the arguments of all choices out.
+def _build_chosen(registry: Registry[Any], by: str, name: str, arguments: dict[str, Any]) -> Any:
+    """Make the settings object of a choice, and remove the arguments of all choices.
 
     Raises:
         UserInputError: an unknown choice, or an option of another one.
@@ -139,15 +138,15 @@ def _build_chosen(registry: Registry[Any], by: str, name: str, given: dict[str, 
     owners: dict[str, list[str]] = {}
     defaults: dict[str, Any] = {}
     for choice, settings in _choices(registry).items():
-        for each, _, declared in _declared(type(settings)):
+        for field, _, declared in _declared(type(settings)):
             if declared is not None:
-                parameter = parameter_name(each.name, declared)
+                parameter = parameter_name(field.name, declared)
                 owners.setdefault(parameter, []).append(choice)
-                defaults.setdefault(parameter, getattr(settings, each.name))
+                defaults.setdefault(parameter, getattr(settings, field.name))
                 if choice == name:
-                    values[each.name] = given[parameter]
+                    values[field.name] = arguments[parameter]
     for parameter, choices in owners.items():
-        value, shown = given.pop(parameter), parameter.replace("_", "-")
+        value, shown = arguments.pop(parameter), parameter.replace("_", "-")
         if name not in choices and value != defaults[parameter]:
             raise UserInputError(
                 f"--{shown} {value} with --{by} {name}: an option of --{by} {' and '.join(choices)}; leave it out"
@@ -156,7 +155,6 @@ def _build_chosen(registry: Registry[Any], by: str, name: str, given: dict[str, 
 
 
 def given_options(context: typer.Context) -> set[str]:
-    """Return the parameters that were given on the command line or in a settings file."""
+    """Return the names of the parameters that the command line or a settings file sets."""
     sources: Mapping[str, Any] = {name: context.get_parameter_source(name) for name in context.params}
-    given = {"COMMANDLINE", "DEFAULT_MAP"}
-    return {name for name, source in sources.items() if source is not None and source.name in given}
+    return {name for name, source in sources.items() if getattr(source, "name", "") in ("COMMANDLINE", "DEFAULT_MAP")}

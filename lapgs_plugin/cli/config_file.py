@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     from lapgs_plugin.training.settings import TrainSettings
 
 OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
-"""Parameters that say where a run goes and how it is started, not what it is."""
+"""Parameters of a call that do not change the trained run."""
+
 META_KEY = "lapgs_plugin.config"
 """Key of click's `Context.meta` for the command's context and the settings file that it reads."""
 
 
 def _load(context: typer.Context, path: Path | None) -> Path | None:
-    """Take the values of a settings file as defaults of the command's other parameters."""
+    """Set defaults of the command's other parameters to the values of a settings file."""
     if path is not None:
         context.default_map = {**(context.default_map or {}), **_read(context, path)}
         context.meta[META_KEY] = context, path
@@ -55,7 +56,7 @@ def naming_the_config(meta: Mapping[str, Any]) -> Iterator[None]:
         option = re.match("(?:invalid value for ')?--([a-z-]+)", str(error))
         name = option[1].replace("-", "_") if option else "scene"
         source = context.get_parameter_source(name)
-        scene = printable(str(context.params.get(name)))  # as it is in messages
+        scene = printable(str(context.params.get(name)))  # messages have it so
         about = option is not None or str(error).startswith((scene, "scene "))
         if source is None or source.name != "DEFAULT_MAP" or not about:
             raise
@@ -83,7 +84,7 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
     """
     if not os.path.lexists(path):
         raise UserInputError(f"--config {path}: no such file; a run folder has one, {RUN_CONFIG}")
-    known = {str(each.name).replace("_", "-"): each for each in context.command.params if each.name not in OF_ONE_CALL}
+    known = {str(one.name).replace("_", "-"): one for one in context.command.params if one.name not in OF_ONE_CALL}
     values: dict[str, Any] = {}
     for key, value in read_toml(path, dict[str, Any]).items():
         name = key.replace("-", "_")
@@ -95,14 +96,14 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
             )
         if not isinstance(value, str | int | float):
             raise UserInputError(f"{path}: {key} is {value!r}, expected a string, a number, true or false")
-        if isinstance(value, bool) and not getattr(known[option], "is_flag", False):  # Python takes it for a number
+        if isinstance(value, bool) and not getattr(known[option], "is_flag", False):  # a bool is an int in Python
             raise UserInputError(f"{path}: {key} is {json.dumps(value)}, expected a value of --{option}")
         values[name] = value
     return values
 
 
 def extended_config(path: Path, settings: TrainSettings) -> str | None:
-    """Return a run's settings file with what the extension of the run changes; None if the run has none.
+    """Return the text of a run's settings file, changed by the extension of the run; None if the run has none.
 
     Args:
         path: of the file.
@@ -128,12 +129,12 @@ def write_config(path: Path, context: typer.Context, **replaced: str | int) -> N
     Args:
         path: of the file.
         context: of the command.
-        replaced: parameters' values that were chosen or mean the same in every folder, instead of those given.
+        replaced: values to write instead of parameters' own, such as absolute paths.
     """
     lines = [
         f"# Made by lapgs {__version__}. The same again: {context.command_path} --config {path.name} -o NEW_FOLDER"
     ]
-    for name in (str(each.name) for each in context.command.params):
+    for name in (str(parameter.name) for parameter in context.command.params):
         value = replaced.get(name, context.params.get(name))
         if value is None or name in OF_ONE_CALL or (isinstance(value, float) and not math.isfinite(value)):
             continue

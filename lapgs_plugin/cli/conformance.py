@@ -49,19 +49,19 @@ def conformance(
 
     subjects = _chosen(rasterizer or [])
     cases = conformance_cases()
-    found = {subject.name: list(check(subject, cases)) for subject in subjects}
-    failed = any(outcome.problems for outcomes in found.values() for outcome in outcomes)
+    outcomes_of = {subject.name: list(check(subject, cases)) for subject in subjects}
+    failed = any(outcome.problems for outcomes in outcomes_of.values() for outcome in outcomes)
     if as_json:
-        print(json.dumps({name: [asdict(item) for item in outcomes] for name, outcomes in found.items()}, indent=1))
+        print(json.dumps(outcomes_of, indent=1, default=asdict))
     else:
         for subject in subjects:
-            _print(subject, found[subject.name])
+            _print(subject, outcomes_of[subject.name])
     if failed:
         raise typer.Exit(1)
 
 
 def reachable() -> dict[str, Callable[[], list[Subject]]]:
-    """Return the rasterizers that this machine can run: by name, a function that makes what is checked."""
+    """Return by name the rasterizers that this machine can run, as functions that make their subjects."""
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
@@ -70,17 +70,17 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 
-    found: dict[str, Callable[[], list[Subject]]] = {
+    subjects: dict[str, Callable[[], list[Subject]]] = {
         "cpu": lambda: [Subject("cpu", CpuRasterizer()), Subject("cpu, float64", CpuRasterizer(), torch.float64)],
         "oracle": lambda: [Subject("oracle, float32", OracleRasterizer())],
     }
     if torch.cuda.is_available():
         for name in installed_extensions():
-            found[name] = partial(_extension_subjects, name)
+            subjects[name] = partial(_extension_subjects, name)
     for name in RASTERIZERS:
         if name != gsplat.NAME or not gsplat.missing():
-            found.setdefault(name, partial(_subject, name))
-    return found
+            subjects.setdefault(name, partial(_subject, name))
+    return subjects
 
 
 def _subject(name: str) -> list[Subject]:

@@ -40,9 +40,9 @@ def doctor(
         bool, typer.Option("--json", help="Print all findings as JSON, for scripts and bug reports.")
     ] = False,
 ) -> None:
-    """Check Python, PyTorch, GPU, compilers and packages, and say what `lapgs train` will use.
+    """Check Python, PyTorch, GPU, compilers and packages, and name the rasterizer of `lapgs train`.
 
-    With a checkout, say what `lapgs run` finds in it: its root, its training function, its rasterizers and what works.
+    With a checkout, describe it: its root, its training function, its rasterizers, and the kinds of levels that work.
     Nothing is changed or downloaded. Lines marked !! are problems and say what to do; lines marked -- are optional
     parts that are not installed. The exit code is 0 unless CHECKOUT is not a checkout.
     """
@@ -52,9 +52,7 @@ def doctor(
 
     sections = examine() if checkout is None else describe(checkout)
     if as_json:
-        print(
-            json.dumps({title: [asdict(finding) for finding in found] for title, found in sections.items()}, indent=2)
-        )
+        print(json.dumps(sections, indent=2, default=asdict))
     else:
         _print(sections)
 
@@ -99,12 +97,13 @@ def examine() -> dict[str, list[Finding]]:
             *(adapters or [current_folder(Path.cwd(), bool(torch.facts.get("gpus")))]),
         ],
     }
-    return {**{title: found for title, found in sections.items() if found}, "lapgs train": _conclusion(sections, torch)}
+    sections["lapgs train"] = _conclusion(sections, torch)
+    return {title: section for title, section in sections.items() if section}
 
 
 @contextmanager
 def _stopping_programs(pool: Executor) -> Iterator[None]:
-    """Kill the programs that a pool's threads run when a signal ends the block, for the process waits for them."""
+    """Kill the programs of a pool's threads when a signal ends the block, because the process waits for them."""
     from lapgs_plugin.environment import stop_programs
 
     try:
@@ -116,7 +115,7 @@ def _stopping_programs(pool: Executor) -> Iterator[None]:
 
 
 def current_folder(folder: Path, has_gpu: bool) -> Finding:
-    """Return whether a folder is a checkout, and on which device `lapgs run` would train it."""
+    """Judge whether a folder is a checkout, and on which device `lapgs run` would train it."""
     from lapgs_plugin.adapters.registry import recognise
     from lapgs_plugin.checkouts.source import readable_sources
     from lapgs_plugin.environment.findings import Finding
@@ -126,15 +125,15 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
     except UserInputError as error:
         return Finding("Current folder", "problem", str(error))
     if adapter is not None:
-        place = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
+        device = "the GPU, with its own extensions" if has_gpu else "the CPU, with stand-ins for its extensions"
         parameters = adapter.archived_parameters()
-        sources = [(each.script, each.hindrance(parameters)) for each in readable_sources(folder)[0]]
+        sources = [(source.script, source.hindrance(parameters)) for source in readable_sources(folder)[0]]
         names = [str(path.relative_to(folder.absolute())) for path, why in sources if why is None]
         if sources and not names:
             detail = f"a checkout of {adapter.info.title} or a fork of it, without levels: {sources[0][1]}"
             return Finding("Current folder", "absent", detail)
         script = adapter.info.script if adapter.info.script in names or not names else names[0]
-        detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run {script} ...` trains it on {place}"
+        detail = f"a checkout of {adapter.info.title} or a fork of it; `lapgs run {script} ...` trains it on {device}"
         return Finding("Current folder", "ok", detail)
     if all((folder / file).is_file() for file in GSPLAT_FILES):
         return Finding("Current folder", "ok", "a checkout of gsplat")
@@ -142,7 +141,7 @@ def current_folder(folder: Path, has_gpu: bool) -> Finding:
 
 
 def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Finding]:
-    """Say what `lapgs train` will use, as `training.backend.choose_rasterizer` decides, or what prevents it."""
+    """Return the rasterizer of `lapgs train`, as `training.backend.choose_rasterizer` decides, or the problems."""
     from lapgs_plugin.environment import gpus_are_hidden
     from lapgs_plugin.environment.findings import Finding
 
@@ -155,9 +154,9 @@ def _conclusion(sections: dict[str, list[Finding]], torch: Probe) -> list[Findin
         advice += f"; {ON_THE_CPU}"
     if not broken and torch.facts["gpus"]:
         triton, gsplat = sections["Backbones"][:2]
-        for rasterizer, what in ((triton, "our kernels"), (gsplat, "gsplat")):
-            if rasterizer.status == "ok":
-                return [Finding("will use", "ok", f"{what} on the GPU, {torch.facts['gpus'][0]}")]
+        for finding, rasterizer in ((triton, "our kernels"), (gsplat, "gsplat")):
+            if finding.status == "ok":
+                return [Finding("will use", "ok", f"{rasterizer} on the GPU, {torch.facts['gpus'][0]}")]
         broken, advice = [triton.name], f"{triton.advice}; {ON_THE_CPU}"
     if broken:
         return [Finding("will use", "problem", f"nothing until this is fixed: {', '.join(broken)}", advice)]
@@ -172,9 +171,9 @@ def _print(sections: dict[str, list[Finding]]) -> None:
     table.add_column()
     table.add_column()
     table.add_column(overflow="fold")  # whole paths, to be copied
-    for title, found in sections.items():
+    for title, findings in sections.items():
         table.add_row("", f"[bold]{title}[/bold]")
-        for finding in found:
+        for finding in findings:
             advice = f"\n[yellow]{escape(finding.advice)}[/yellow]" if finding.advice else ""
             table.add_row(MARKS[finding.status], escape(finding.name), escape(finding.detail) + advice)
     console = make_console()

@@ -19,18 +19,17 @@ from lapgs_plugin.environment.findings import Finding
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 
 COLORS = {"shs", "colors_precomp"}
-"""Inputs of rasterizers by which a residual gets colours of both signs."""
+"""Inputs of rasterizers that accept signed colours."""
 
 
 def describe(path: Path) -> dict[str, list[Finding]]:
-    """Return what `lapgs run` makes of a checkout, by section.
+    """Return findings about a checkout for `lapgs run`, by section.
 
     Args:
         path: its root, its training script, or a folder of scripts in it.
 
     Raises:
-        UserInputError: it is no 3DGS checkout, and the line says what is missing; or it has several training scripts
-            and none of them is `train.py` in its root.
+        UserInputError: it is no 3DGS checkout; or it has several training scripts, none of them `train.py` in its root.
     """
     source, others = _source(path)
     unused = f"none of the {len(source.modules)} modules that the script imports uses one"
@@ -52,7 +51,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
 
 
 def _source(path: Path) -> tuple[CheckoutSource, list[Finding]]:
-    """Return the sources of the training script to describe, and what is said of other training scripts."""
+    """Return the sources of the training script to describe, and findings about other training scripts."""
     if path.is_file():
         return CheckoutSource.read(path), []
     if (advice := known_trainer(path)) is not None:
@@ -82,7 +81,7 @@ def _hindrance(source: CheckoutSource) -> str | None:
 
 
 def _gaussians(source: CheckoutSource) -> str:
-    """Return the class of the Gaussians with its place, or all that the script may choose."""
+    """Return the class of the Gaussians with its file, or all that the script may choose."""
     if len(source.models) == 1:
         return f"{source.model[1]}: {source.model[0]}"
     choice = [f"{source.place(node)} chooses: {ast.unparse(node)}" for node in source.model_statements[-1:]]
@@ -110,13 +109,15 @@ def _packages(source: CheckoutSource) -> list[Finding]:
 
 
 def _schedule(source: CheckoutSource) -> list[Finding]:
-    """Return what the training loop does at which iteration."""
+    """Return the events of the training loop with their iterations."""
     lines = [line.partition(": ") for line in Schedule(source.training).describe()]
-    return [Finding(place, "ok", event) for place, _, event in lines] or [Finding("none", "ok", "counts no iterations")]
+    return [Finding(iterations, "ok", event) for iterations, _, event in lines] or [
+        Finding("none", "ok", "counts no iterations")
+    ]
 
 
 def _kinds_of_models(source: CheckoutSource) -> list[Finding]:
-    """Return which kinds of hierarchy work; where the script may choose several models, with the first of them."""
+    """Return which kinds of hierarchy work: with the first model where the script may choose several."""
     first, *others = ((name, _kinds(replace(source, model=(name, where)))) for name, where in source.models)
     findings = []
     for i, finding in enumerate(first[1]):

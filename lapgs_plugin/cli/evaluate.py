@@ -110,8 +110,8 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
     cameras = path_cameras(archive, trajectory, settings.frames, FLICKER_FRAMES, options.scene)
     figures = evaluate_stability(archive, other, trajectory, cameras, options)
     table = make_table("", "mean difference", "PSNR (dB)")
-    for name, each in figures["flicker"].items():
-        table.add_row(name, f"{each['mean']:.5f}", f"{each['psnr']:.2f}")
+    for name, difference in figures["flicker"].items():
+        table.add_row(name, f"{difference['mean']:.5f}", f"{difference['psnr']:.2f}")
     console = make_console()
     width, height = figures["size"]
     console.print(
@@ -162,11 +162,9 @@ def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
     table = make_table("level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR", "upsampled")
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]
-        table.add_row(
-            *(level, f"{width}x{height}", f"{figures['iterations']:,}", f"{figures['train_seconds']:.1f}"),
-            *(f"{figures['num_gaussians']:,}", f"{figures['peak_gaussians']:,}"),
-            *(f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}"),
-        )
+        cells = [f"{width}x{height}", f"{figures['iterations']:,}", f"{figures['train_seconds']:.1f}"]
+        cells += [f"{figures['num_gaussians']:,}", f"{figures['peak_gaussians']:,}"]
+        table.add_row(level, *cells, f"{figures['psnr']:.2f}", f"{figures['upsampled_psnr']:.2f}")
     console.print(
         "[bold]Levels as trained[/bold], PSNR in dB at the level's size and upsampled without finer levels", table
     )
@@ -177,8 +175,8 @@ def _print_breakdown(console: Console, metrics: dict[str, Any]) -> None:
     table = make_table("part", *(f"level {level}" for level, _ in levels), "run")
     total = sum(metrics["breakdown_seconds"].values())
     for part, seconds in metrics["breakdown_seconds"].items():
-        each = [f"{1e3 * f['breakdown_seconds'][part] / f['iterations']:.2f} ms" for _, f in levels]
-        table.add_row(part, *each, f"{seconds:.1f} s, {seconds / total:.1%}")
+        cells = [f"{1e3 * f['breakdown_seconds'][part] / f['iterations']:.2f} ms" for _, f in levels]
+        table.add_row(part, *cells, f"{seconds:.1f} s, {seconds / total:.1%}")
     console.print("[bold]Where the time of iterations went[/bold], an iteration of each level", table)
 
 

@@ -24,7 +24,7 @@ PAGE, MERGED = "scene.html", "merged"
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """Choose which fields of a run are exported, and as what.
+    """Choose which fields of a run are exported, and their format.
 
     Raises:
         UserInputError: a value is unknown or out of range, or an option has no effect with the others.
@@ -100,11 +100,11 @@ def export(
 def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
     """Write the field of each chosen level as a file."""
     levels = _levels(archive, settings.level)
-    fields = {each: archive.field(each) for each in levels}  # a damaged one ends the command before anything is written
+    fields = {level: archive.field(level) for level in levels}  # a damaged one is refused before anything is written
     _make(folder)
-    for each, field in fields.items():
-        path = folder / f"{_level_name(archive, each)}.{settings.file_format}"
-        _write_field(field, path, _note(archive, each))
+    for level, field in fields.items():
+        path = folder / f"{_level_name(archive, level)}.{settings.file_format}"
+        _write_field(field, path, _note(archive, level))
         _print_written(path, field, ", a residual" if field.signed else "")
 
 
@@ -191,7 +191,7 @@ def _level_name(archive: RunArchive, level: int) -> str:
 
 
 def _note(archive: RunArchive, level: int) -> str:
-    """Return a comment for the file's header that says what the level is."""
+    """Return a comment for the file's header that describes the level."""
     name, levels = archive.name, archive.manifest.levels
     if level == levels - 1:
         return f"base of {name}, a hierarchy of {levels} levels" if levels > 1 else f"field of {name}"

@@ -12,7 +12,7 @@ import typer
 
 
 def join_lines(group: typer.Typer) -> None:
-    """Join the lines of each paragraph of the help texts, which typer would print broken as they are in the source."""
+    """Join the lines of each paragraph of the help texts, because typer keeps the line breaks of the source."""
     for command in [*group.registered_commands, group.registered_callback]:
         if command is not None and command.callback is not None:
             text = command.help if isinstance(command.help, str) else command.callback.__doc__
@@ -24,7 +24,7 @@ def join_lines(group: typer.Typer) -> None:
 
 
 def show_flags_without_type(command: Any) -> None:
-    """Leave out `<bool>` behind flags in help texts: it reads as if a value had to follow."""
+    """Leave out `<bool>` behind flags in help texts, which take no value."""
     for parameter in command.get_params(typer.Context(command)):
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
@@ -33,7 +33,7 @@ def show_flags_without_type(command: Any) -> None:
 
 
 def module_summary(module: str) -> str:
-    """Return the first line of a module's docstring as its source has it, or the module's name; nothing is imported."""
+    """Return the first line of a module's docstring from its source, or the module's name; nothing is imported."""
     package, *below = module.split(".")
     try:
         spec: Any = find_spec(package)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNLIMITED = 10_000
-"""Width in columns where there is no terminal: more than any table has."""
+"""Width in columns without a terminal, more than that of any table."""
 
 
 def make_console(*, stderr: bool = False) -> Console:

@@ -23,7 +23,7 @@ app = typer.Typer(
 
 
 def _root(path: Path) -> Path:
-    """Return the root of the checkout that a training script, or a folder of such scripts, is in; else the path."""
+    """Return the root of the checkout around a training script or a folder of such scripts; else the path."""
     from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
 
     if path.suffix == ".py" and is_file(path):
@@ -62,14 +62,14 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     with _alone(chosen):
         for target, sets in chosen:
             say(f"{target.folder}: {target.recipe.title}")
-            for found in status(target):
-                if found.set not in sets:
+            for edits in status(target):
+                if edits.set not in sets:
                     continue
-                say(f"  {found.set:14} {found.state.value}")
-                for problem in found.problems:
+                say(f"  {edits.set:14} {edits.state.value}")
+                for problem in edits.problems:
                     say(f"    {problem}")
-                if not found.problems:
-                    for path in read_only(plan_apply(target, [found.set])):
+                if not edits.problems:
+                    for path in read_only(plan_apply(target, [edits.set])):
                         say(f"    read-only: {path}")
             for path in uncommitted(target.paths.values()):
                 say(f"  uncommitted changes: {path}")
@@ -162,9 +162,8 @@ def _write(verb: str, planned: Sequence[tuple[Target, FileChange]], allow_dirty:
     write_all(changes)
     for change in changes:
         say(f"{verb} {change.path}")
-    commands = [target.reinstall for target, _ in planned]
     say("Next, reinstall the changed extensions:")
-    for command in dict.fromkeys(commands):
+    for command in dict.fromkeys(target.reinstall for target, _ in planned):
         say(f"  {command}")
 
 

@@ -57,7 +57,7 @@ def prepare(
 
 
 def _next_command(out: Path, registered: Sequence[str]) -> str:
-    """Return the command that trains the scene, with options for minutes where a CPU would take hours."""
+    """Return the command that trains the scene. It has options for minutes where a CPU would take hours."""
     from lapgs_plugin.scenes.images import image_size
     from lapgs_plugin.scenes.prepare.photos import target_name
     from lapgs_plugin.training.backend import MINUTES_ON_A_CPU, choose_rasterizer, long_on_a_cpu
@@ -66,7 +66,7 @@ def _next_command(out: Path, registered: Sequence[str]) -> str:
     iterations = TrainSettings().for_photos(len(registered)).iterations
     size = image_size(out / "images" / target_name(registered[0]))
     if long_on_a_cpu(size, iterations):
-        with suppress(MissingExtraError):  # there is a GPU, and `lapgs train` says what it needs
+        with suppress(MissingExtraError):  # of a machine with a GPU
             if choose_rasterizer(AUTO) == "cpu":
                 return train_command(out, MINUTES_ON_A_CPU)
     return train_command(out)

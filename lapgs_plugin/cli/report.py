@@ -104,14 +104,14 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     from lapgs_plugin.evaluation.lpips import missing_lines
     from lapgs_plugin.reports.comparison import comparison_rows, setup_differences
 
-    names = [escape(each.archive.name) for each in runs]
+    names = [escape(run.archive.name) for run in runs]
     table = make_table("", *names, *(["change"] if len(runs) > 1 else []))
-    for row in comparison_rows([each.metrics for each in runs]):
+    for row in comparison_rows([run.metrics for run in runs]):
         cells = ["\n".join([cell.text, *(f"[dim]{part}[/dim]" for part in cell.parts)]) for cell in row.cells]
         table.add_row(row.label, *cells, *([row.change] if len(runs) > 1 else []))
     console = make_console()
     console.print(table)
-    for line in missing_lines({name: why for each in runs for name, why in each.metrics["lpips_missing"].items()}):
+    for line in missing_lines({name: why for run in runs for name, why in run.metrics["lpips_missing"].items()}):
         console.print(f"{line}; then repeat lapgs eval", markup=False, soft_wrap=True)
     if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
         console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}")

@@ -10,7 +10,7 @@ import typer
 from lapgs_plugin.cli.output import say, train_command
 
 MINUTES_ON_A_CPU = "--iterations 2000"
-"""Options that are proposed: by its number of views the scene would get ten thousand."""
+"""Proposed options; the default for the scene's number of views would be ten thousand iterations."""
 
 
 def sample(

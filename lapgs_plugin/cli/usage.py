@@ -1,4 +1,4 @@
-"""Say in one line why click refused a command line."""
+"""Turn click's usage errors into one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WITH_BASELINE = ("report", "view")
 
 
 def usage_message(error: Any) -> str:
-    """Return the message of a usage error, with the value that was refused where one was."""
+    """Return the message of a usage error, with the refused value if there is one."""
     refused: Any = getattr(error.__cause__, "errors", list)()  # pydantic's, whose message leaves out the value
     if refused and getattr(error, "param", None) is not None:
         expected = refused[0]["msg"]

@@ -1,4 +1,4 @@
-"""Options and helpers of the commands that open a viewer."""
+"""Open the viewer for commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def open_page(host: str, port: int, label: str, until: str, preview: Image | Non
     Args:
         host, port: address to listen on; a taken port is replaced by the next free one.
         label: title of the page.
-        until: when the page is closed, for the printed line.
+        until: clause about the end of the page, for the printed line.
         preview: image to show until the first one is rendered.
     """
     from lapgs_plugin.viewer.page import Page
@@ -56,7 +56,7 @@ def open_page(host: str, port: int, label: str, until: str, preview: Image | Non
 
 @contextmanager
 def watching(options: ViewOptions, label: str, device: str = "auto") -> Iterator[Watcher]:
-    """Return a watcher for a training run: the viewer with `--view`, else one that does nothing.
+    """Yield a watcher for a training run: the viewer with `--view`, else one that does nothing.
 
     Args:
         options: whether to show the run, and where.

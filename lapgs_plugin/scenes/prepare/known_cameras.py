@@ -128,7 +128,6 @@ def read_known_cameras(cameras: Path, photos: Path, settings: PrepareSettings) -
             )
     transforms = find_model(cameras, (".",)) is None
     model, source, folder = (_from_transforms if transforms else _from_model)(cameras, photos)
-    _check_lenses(model)
     frames = source.train
     present = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in present})
@@ -180,6 +179,7 @@ def _from_transforms(cameras: Path, photos: Path) -> tuple[Model, SceneSource, P
             f"{photos / SINGLE_FILE} lists {len(frames)} photos and {other} {count}; those of the former are used, as "
             f"by `lapgs train`; --model {quote(str(other))} takes the latter"
         )
+    _check_lenses(model)
     return model, source, photos
 
 
