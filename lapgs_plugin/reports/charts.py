@@ -6,19 +6,21 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-CHARACTER_WIDTH, LINE_HEIGHT = 7.5, 14.0
-"""Approximate size of a label's text."""
+CHARACTER_WIDTH = 7.5
+"""Approximate width of a character of a label in chart units."""
+LINE_HEIGHT = 14.0
+"""Height of a line of labels in chart units."""
 TICKS, INSET_TICKS = 5, 3
 HEADROOM = 1.04
 INSET_POINTS = 3
-"""Least number of points at the start of a line for an inset."""
+"""Fewest points at the start of a line for an inset."""
 FEW_POINTS = 20
-"""Most points of a line whose points are marked: between few points a line is no measurement."""
+"""Most points of a line whose points are marked. Between so few points a line is no measurement."""
 LEAST_SPAN = 0.02
 """Least span of an axis as a share of its largest value, so that labels of a flat line stay short."""
 BAR_STEP = 30.0
 ARROW_HEAD = 4.0
-"""Length of an arrow's head in chart units; the line ends so far before its point."""
+"""Length of an arrow's head in chart units, by which its line is shorter."""
 
 
 def count_text(value: float) -> str:
@@ -311,12 +313,12 @@ def draw_arrows(title: str, x_label: str, arrows: Sequence[Arrow], text: Callabl
     y_ticks = _ticks(0.0, max(y for _, y in points) * HEADROOM, TICKS)
     top = y_ticks[-1]
 
-    def place(point: tuple[float, float]) -> tuple[float, float]:
+    def to_chart(point: tuple[float, float]) -> tuple[float, float]:
         return WHOLE.x(point[0] / right), WHOLE.y(point[1] / top)
 
     placed = []
     for arrow in arrows:
-        start, end = place(arrow.start), place(arrow.end)
+        start, end = to_chart(arrow.start), to_chart(arrow.end)
         length = math.dist(start, end)
         share = max(0.0, 1.0 - ARROW_HEAD / length) if length else 1.0
         tip = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
@@ -373,8 +375,7 @@ def _x_ticks(right: float, count: int, text: Callable[[float], str], frame: Fram
 
 
 def _ticks(low: float, high: float, count: int) -> list[float]:
-    """Return about `count` round numbers from at or below `low` to at or above `high`, in steps of 1, 2 or 5 times a
-    power of ten."""
+    """Return about `count` round numbers whose range covers `low` to `high`, in steps of {1, 2, 5} * 10^n."""
     span = max(high - low, LEAST_SPAN * max(abs(high), 1e-6))
     power = 10.0 ** math.floor(math.log10(span / count))
     step = next(factor * power for factor in (1, 2, 5, 10) if span / (factor * power) <= count)

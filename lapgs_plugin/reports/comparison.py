@@ -20,7 +20,7 @@ OPTIONAL_ROWS = {"gpu_busy_seconds", "mean_gaussians", "peak_memory_bytes", "pea
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure of one run.
+    """A figure of one run.
 
     Attributes:
         value: the number; None when it was not measured.
@@ -35,7 +35,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of each run.
+    """A figure of all runs.
 
     Attributes:
         key: short name for scripts.
@@ -58,7 +58,7 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
         *(
             (key, f"{title}, {views} views", "{:.4f}", _difference("{:+.4f}"))
-            for key, title in lpips_titles({name for each in metrics for name in each}).items()
+            for key, title in lpips_titles({name for run in metrics for name in run}).items()
         ),
         ("train_seconds", "Optimization (s)", "{:.1f}", _speed),
         ("gpu_busy_seconds", "GPU busy (s)", "{:.1f}", _speed),
@@ -75,9 +75,9 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     for key, label, pattern, compare in table:
         scale = 1e-9 if key.endswith("_bytes") else 1.0
         cells = tuple(
-            # A loop of the user's own that has measured no time has recorded 0 seconds.
-            _cell(each.get(key) or None if key == "train_seconds" else each.get(key), pattern, scale)
-            for each in metrics
+            # A user's own loop that measures no time records 0 seconds.
+            _cell(run.get(key) or None if key == "train_seconds" else run.get(key), pattern, scale)
+            for run in metrics
         )
         values = [cell.value for cell in cells if cell.value is not None]
         if not values and key in OPTIONAL_ROWS:
@@ -111,7 +111,7 @@ def _ratio(run: float, baseline: float) -> str:
 
 
 def setup_differences(run: Manifest, baseline: Manifest) -> list[str]:
-    """List the differences in setup, in words, that keep two runs from being a comparison of methods."""
+    """Describe the differences in setup that make a comparison of two runs unfair."""
     pairs = {
         "scene": (run.scene.path, baseline.scene.path),
         "images": (run.scene.images, baseline.scene.images),

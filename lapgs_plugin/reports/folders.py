@@ -1,4 +1,4 @@
-"""Declare the folders that `lapgs report` makes a page of besides runs; entry points bring them."""
+"""Declare the folders besides runs on which `lapgs report` reports; entry points bring them."""
 
 from __future__ import annotations
 

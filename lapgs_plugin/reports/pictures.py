@@ -21,8 +21,9 @@ IMAGE_SIDE = 800
 MOST_COLUMNS = 5
 CUTOUTS = 2
 """Number of enlarged parts of a view."""
-CUTOUT_SHARE, CUTOUT_LEAST, CUTOUT_MOST = 1 / 6, 16, 96
-"""Side of a cut-out as a share of the image's shorter side, and its limits in pixels."""
+CUTOUT_SHARE = 1 / 6
+"""Side of a cut-out as a share of the image's shorter side."""
+CUTOUT_LEAST, CUTOUT_MOST = 16, 96  # limits of this side in pixels
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Cutout:
     """A part of a view with strong edges, cut out of every picture of the view.
 
     Attributes:
-        left, top, width, height: its place in percent of the image.
+        left, top, width, height: in percent of the image.
         side: of the square in pixels, at full resolution.
         pictures: in the order of the view's pictures, at full resolution.
     """
@@ -115,7 +116,7 @@ def make_strip(view: View, why: str, figures: str, renderers: Sequence[Hierarchy
         renderers: of the run, then of its baseline.
     """
     layers = _layers(view, renderers)
-    cutouts = tuple(_cut_out(layers, place) for place in edge_squares(view.image, CUTOUTS))
+    cutouts = tuple(_cut_out(layers, square) for square in edge_squares(view.image, CUTOUTS))
     return Strip(view.name, why, figures, tuple(_shrink(layer) for layer in layers), cutouts)
 
 
@@ -149,7 +150,7 @@ def _level_label(level: int, image: Tensor) -> str:
 
 
 def edge_squares(photo: Tensor, count: int) -> list[tuple[int, int, int]]:
-    """Find squares with strong edges: those that lose most in one pyramid level.
+    """Return the squares with the strongest edges, which lose most in one pyramid level.
 
     Args:
         photo: (3, h, w).

@@ -46,8 +46,7 @@ MINUTES_FROM = 300.0
 """Least length of a run, in seconds, whose charts show minutes."""
 START_SHARE = 0.15
 """Share of the longest run's time that the inset shows."""
-RUN, BASELINE = "run", "baseline"
-"""Styles of lines and arrows."""
+RUN, BASELINE = "run", "baseline"  # styles of lines and arrows
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
     """
     runs = [run] if baseline is None else [run, baseline]
     kinds = [RUN, BASELINE][: len(runs)]
-    renderers = [run_renderer(each.archive, options.device, options.rasterizer) for each in runs]
+    renderers = [run_renderer(measured.archive, options.device, options.rasterizer) for measured in runs]
     page = render_page(
         TEMPLATE,
         name=run.name,
@@ -98,7 +97,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         measured=MEASURED[run.metrics["split"]],
         baseline_name=baseline.name if baseline else None,
         differences=setup_differences(run.archive.manifest, baseline.archive.manifest) if baseline else [],
-        rows=comparison_rows([each.metrics for each in runs]),
+        rows=comparison_rows([measured.metrics for measured in runs]),
         charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,
         weak=weak_levels(
@@ -130,8 +129,6 @@ def render_page(template: Path, **values: Any) -> str:
     return environment.get_template(template.name).render(values, inset_at=INSET_AT)
 
 
-# Charts of training.
-
 History = list[dict[str, Any]]
 
 
@@ -162,7 +159,7 @@ def training_charts(
 def _history(run: MeasuredRun, scale: float) -> History:
     """Return a run's history with "time", in units of `scale` seconds, and "iterations" since the run's start.
 
-    Entries that were made after a stage have the time of its end. The file counts iterations within a stage.
+    Entries from after a stage have the time of its end. The file counts iterations within a stage.
     """
     records, history = run.archive.manifest.records, []
     for entry in run.archive.history():
@@ -186,7 +183,7 @@ def _chart_row(
             for entry in history:
                 if key in entry:
                     points.setdefault(entry["level"] if by_stage else 0, []).append((entry[x], entry[key]))
-            series += [Series(kind, each) for each in points.values()]
+            series += [Series(kind, line) for line in points.values()]
         if series:
             inset = None if by_stage else start
             charts.append(draw_lines(title, x_label, series, marks=marks, from_zero=by_stage, inset_until=inset))
@@ -203,14 +200,11 @@ def _stage_marks(history: History, x: str) -> list[Mark]:
     return [Mark(begin, f"level {level}") for level, begin in begins.items()] if len(begins) > 1 else []
 
 
-# Time and number of Gaussians.
-
-
 def _time_arrows(run: MeasuredRun, baseline: MeasuredRun) -> Chart | None:
     """Draw time against Gaussians, as an arrow from the baseline to the run, if both have measured their time."""
     if not (run.metrics["train_seconds"] and baseline.metrics["train_seconds"]):
         return None
-    ends = [(each.metrics["weighted_gaussians"], each.metrics["train_seconds"]) for each in (baseline, run)]
+    ends = [(one.metrics["weighted_gaussians"], one.metrics["train_seconds"]) for one in (baseline, run)]
     label = "Gaussians of levels, weighted by iterations"
     return draw_arrows("Optimization (s) against Gaussians", label, [Arrow(RUN, "", *ends)])
 
@@ -221,9 +215,9 @@ def breakdown_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
     for run in runs:
         for record in run.archive.manifest.records:
             if record.breakdown_seconds:
-                what = f", level {record.level}" if run.archive.manifest.levels > 1 else ""
+                level = f", level {record.level}" if run.archive.manifest.levels > 1 else ""
                 total = sum(record.breakdown_seconds.values())
-                label = f"{run.name}{what}: {number_text(1e3 * total / record.iterations)} ms an iteration"
+                label = f"{run.name}{level}: {number_text(1e3 * total / record.iterations)} ms an iteration"
                 bars.append(Bar(label, list(record.breakdown_seconds.items())))
     return draw_bars("Optimization", bars, seconds_text) if bars else None
 
@@ -232,9 +226,6 @@ def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
     """Draw the time outside the optimization."""
     bars = [Bar(run.name, list(run.metrics["overhead_seconds"].items())) for run in runs]
     return draw_bars("Overhead", bars, seconds_text) if any(b.parts for b in bars) else None
-
-
-# Views.
 
 
 def view_strips(
@@ -282,7 +273,7 @@ def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
     """Make the table of all views of a run, the worst PSNR first, beside those of its baseline if there is one."""
     views = sorted(runs[0].metrics["views"], key=lambda view: float(view["psnr"]))
     keys = {"psnr": "PSNR (dB)", "ssim": "SSIM", **lpips_titles(set.intersection(*map(set, views)))}
-    others = [{view["name"]: view["psnr"] for view in each.metrics["views"]} for each in runs[1:]]
+    others = [{view["name"]: view["psnr"] for view in baseline.metrics["views"]} for baseline in runs[1:]]
     rows = {}
     for view in views:
         cells = [(view[key], f"{view[key]:.2f}" if key == "psnr" else f"{view[key]:.4f}") for key in keys]
@@ -295,7 +286,7 @@ def view_table(runs: Sequence[MeasuredRun]) -> ViewTable:
 
 
 def knows_options(manifest: Manifest) -> bool:
-    """Return whether a run has options of `lapgs train` or `lapgs run`: no loop of the user's own, no imported run."""
+    """Return whether `lapgs train` or `lapgs run` trained a run: no loop of the user's own, no imported run."""
     return "iterations" in manifest.settings and not is_imported(manifest)
 
 

@@ -25,7 +25,7 @@ TEMPLATE = Path(__file__).with_name("splats.html.jinja")
 NEAREST_TARGET = 0.05
 """Least distance of the point that the view turns around, in distances of the cameras from their focus."""
 INVISIBLE = 1.0 / 255.0
-"""Opacities below this are drawn by no rasterizer."""
+"""Opacity below which no rasterizer draws a Gaussian."""
 
 LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
 
@@ -85,14 +85,14 @@ def splat_bytes(field: GaussianField) -> bytes:
 
 
 def _start(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Return the first view as the page takes it: pose, field of view, and the point and axis to turn around."""
+    """Return the first view for the page: pose, field of view, and the point and axis to turn around."""
     rig, camera = Rig.of(cameras), cameras[0]
-    place, ahead = camera.position.double().numpy(), forward(camera)
-    depth = max(float(np.dot(rig.focus - place, ahead)), NEAREST_TARGET * rig.distance)
+    position, ahead = camera.position.double().numpy(), forward(camera)
+    depth = max(float(np.dot(rig.focus - position, ahead)), NEAREST_TARGET * rig.distance)
     return {
-        "place": place.tolist(),
+        "place": position.tolist(),
         "rotation": camera.world_to_camera[:3, :3].double().numpy().ravel().tolist(),  # rows right, down, forward
-        "target": (place + depth * ahead).tolist(),
+        "target": (position + depth * ahead).tolist(),
         "up": rig.up.tolist(),
         "focal": [camera.fx / camera.width, camera.fy / camera.height],
     }

@@ -14,14 +14,16 @@ MAX_GAIN, GAIN_STEP = 3.0, 0.05
 COMPOSITION = "composition"
 BY_SIZE = "by distance and window"
 
-SHEET_WIDTH, FLAT = 576, 2.1
-"""Width below which viser shows its panel as a sheet over the picture; width over height of a phone on its side."""
+SHEET_WIDTH = 576
+"""Width in pixels below which viser shows its panel as a sheet over the picture."""
+FLAT = 2.1
+"""Width over height of a phone in landscape."""
 MARGIN = 15
 """CSS pixels between the controls of a narrow window and its border."""
 
 
 class Controls:
-    """The panel of one client.
+    """Build and read the panel of one client.
 
     Args:
         client: the client.
@@ -79,7 +81,7 @@ class Controls:
             part.remove()
 
     def fits(self, run: ShownRun, other: ShownRun | None) -> bool:
-        """Tell whether the panel fits these runs; if so, it shows them from now on."""
+        """Return whether the panel fits these runs. If so, it shows them from now on."""
         if run.counts.keys() != self._run.counts.keys() or (other is None) != (self._split is None):
             return False
         self._run = run
@@ -117,7 +119,7 @@ class Controls:
         self._figures.content = "\n".join([*rows, "", line])
 
     def _room(self, camera: viser.CameraHandle) -> AbstractContextManager[Any]:
-        """Return where to add controls: the main panel, or a closed one in a narrow window, which that would cover."""
+        """Return the container of the controls: the main panel, or in a narrow window a minimized one."""
         width, height = camera.image_width, camera.image_height  # device pixels, up to three a CSS pixel on phones
         if max(height, SHEET_WIDTH) <= width <= FLAT * height:
             return nullcontext()

@@ -34,9 +34,9 @@ Stamp = tuple[int, int] | None  # time of the last change in nanoseconds, and si
 
 
 def load_rasterizer(placed: PlacedRasterizer) -> None:
-    """Render a tiny picture, to load all that pictures need: on a GPU its context, kernels and compilers.
+    """Render a tiny picture to load the renderer: on a GPU its context, kernels and compilers.
 
-    Errors are ignored here, because the first real picture reports them.
+    Errors are ignored, because the first real picture reports them.
     """
     camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4))
     ahead = torch.tensor([[0.0, 0.0, 1.0]])
@@ -47,13 +47,13 @@ def load_rasterizer(placed: PlacedRasterizer) -> None:
 
 
 class FollowedRun:
-    """The levels of a run that can be shown: finished, undamaged, from the coarsest on without gaps.
+    """Read the levels of a run that can be shown: finished, undamaged, from the coarsest on without gaps.
 
     Attributes:
-        options: where the scene is, and what renders the run.
-        archive: the archive when last read.
+        options: folder of the scene, rasterizer and device.
+        archive: as last read.
         shown: the run; None while it has no level.
-        problem: one line about the first level that is missing or damaged; None without.
+        problem: a line about the first missing or damaged level; None without any.
 
     Raises:
         RunFolderError: there is no run, it has another version, or its coarsest level is damaged.
@@ -76,7 +76,7 @@ class FollowedRun:
             raise RunFolderError(self.problem)
 
     def refresh(self) -> bool:
-        """Read changes; False when there are none.
+        """Read changes, and return whether there were any.
 
         Raises:
             RunFolderError: the run is missing or damaged; the earlier state is kept.
@@ -86,7 +86,7 @@ class FollowedRun:
         self._read()
         return True
 
-    def place(self, rig: Rig) -> None:
+    def set_cameras(self, rig: Rig) -> None:
         """Set the training cameras."""
         self._rig = rig
         if self.shown is not None:
@@ -132,7 +132,7 @@ class FollowedRun:
 
 
 class RunFollower:
-    """Keeps a viewer and the status on its page up to date with a run, and perhaps with another one beside it.
+    """Keep a viewer and the status on its page up to date with a run, and with a second one if there is one.
 
     `report` is called with each new line of status.
     """
@@ -161,11 +161,11 @@ class RunFollower:
             self._report(f"without the scene's cameras: {error}")
         else:
             for run in self._runs:
-                run.place(self._cameras.rig)
+                run.set_cameras(self._cameras.rig)
         self._show()
 
     def warm_up(self) -> None:
-        """Render a small picture that loads all that pictures need, unless a client already waits for one."""
+        """Render a small picture to load the renderer, unless a client already waits for one."""
         shown = self._runs[0].shown
         if shown is None or self._viewer.watched:
             return

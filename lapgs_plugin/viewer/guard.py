@@ -41,10 +41,10 @@ ProcessRequest = Callable[[ServerConnection, Request], Response | None]
 class Guard:
     """Decide by which names a browser may address this machine.
 
-    - Always localhost and the loopback addresses with any port, because a tunnel has its own port.
-    - If other machines may connect: `host`, its addresses, and the names of this machine.
-    - On all addresses: any address too. A numeric address cannot be a page's name, and a machine behind a router or in
-      a container does not know its own.
+    - Always by localhost and the loopback addresses, with any port, because a tunnel has its own port.
+    - If other machines may connect, also by `host`, its addresses, and the names of this machine.
+    - If `host` stands for all addresses, also by any address. A numeric address cannot be a page's name, and a machine
+      behind a router or in a container does not know its own address.
 
     Args:
         host: address or name that the viewer listens on.
@@ -54,8 +54,8 @@ class Guard:
         self._logged: set[str] = set()
         addresses = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None)}
         self._names = {"localhost", host.lower(), *addresses}
-        self._any_address = any(ipaddress.ip_address(each).is_unspecified for each in addresses)
-        if all(ipaddress.ip_address(each).is_loopback for each in addresses):
+        self._any_address = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
+        if all(ipaddress.ip_address(address).is_loopback for address in addresses):
             return
         own = socket.gethostname().lower()
         self._names |= {own, own.partition(".")[0], own.partition(".")[0] + ".local"}
@@ -95,8 +95,7 @@ class Guard:
 def guarded_server(guard: Guard) -> Iterator[None]:
     """Guard the web socket server that viser starts inside the block.
 
-    viser has no hook for this, so `serve` of websockets, by which it starts its server, is replaced in the block. The
-    hooks of `serve` do the work.
+    viser has no hook for this. So `serve` of websockets, by which viser starts its server, is replaced in the block.
 
     Raises:
         LapgsError: no server was started this way, so it is not guarded and must be closed.

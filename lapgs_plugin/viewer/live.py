@@ -1,8 +1,8 @@
 """Show a run while it is trained.
 
-The training thread draws the pictures between two iterations. So nothing is copied, density control does not interfere,
-and the cost is known: the next picture waits until the pictures' share of the time is below the limit. An error here
-ends the view, never the training.
+The training thread draws the pictures between two iterations. So nothing is copied, and density control does not
+interfere. The next picture waits until the pictures' share of the time is below the limit. An error here ends the view,
+never the training.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ from lapgs_plugin.viewer.viewer import Viewer
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_PERCENT, MAX_PERCENT = 1.5, 50.0
-"""Share of the training time for pictures, in percent."""
+DEFAULT_PERCENT = 1.5
+"""Share of the training time for pictures, in percent, until the user changes it."""
+MAX_PERCENT = 50.0
+"""Largest such share."""
 
 LIVE_BUDGET = PictureBudget(moving=0.02, still=0.06, ahead=False)
 """Time of a picture while the camera moves, and while it rests."""
@@ -40,11 +42,11 @@ PAUSE_POLL_SECONDS = 0.1
 
 
 class LiveView(Watcher):
-    """Shows a run to all clients of a page. Close the page after the run.
+    """Show a run to all clients of a page. Close the page after the run.
 
     Args:
         page: the page.
-        device: where pictures are rendered, see `rasterizer_for`.
+        device: of rendering, see `rasterizer_for`.
     """
 
     def __init__(self, page: Page, device: str = "auto") -> None:

@@ -1,4 +1,4 @@
-"""Decide when to draw a client's next picture and at which size: small during motion, larger step by step at rest."""
+"""Decide the time and size of a client's next picture: small during motion, larger step by step at rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SMALLEST, STEP = 1.0 / 8.0, 2.0
 
 
 class Pacing:
-    """Decides the scale of a client's next picture from the times of the last ones.
+    """Decide the scale of a client's next picture from the times of the last ones.
 
     A scale is a share of the window's width and height, in (0, 1]. All times come from one clock, in seconds.
 
@@ -51,7 +51,7 @@ class Pacing:
         return settled if self._drawn < self._largest else None
 
     def begin(self) -> float:
-        """Return the scale to draw at now; later changes need another picture."""
+        """Return the scale of a picture that is drawn now. Later changes need another picture."""
         self._renewed = None
         if self._changed is None:
             return min(self._largest, STEP * self._drawn)
@@ -59,7 +59,7 @@ class Pacing:
         return self._moving
 
     def end(self, scale: float, seconds: float) -> None:
-        """Note that a picture at the scale of `begin` was drawn and sent in so many seconds."""
+        """Note the seconds in which a picture at the scale of `begin` was drawn and sent."""
         self._drawn = scale
         # A damped step keeps noise out of the size.
         self._moving = math.sqrt(self._moving * _fitting(scale, seconds, self._moving_seconds))

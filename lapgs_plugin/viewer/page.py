@@ -44,7 +44,7 @@ def free_port(host: str, port: int) -> int:
 
 
 class Page:
-    """A web page, served until it is closed; also a context manager.
+    """Serve a web page until it is closed; also a context manager.
 
     Attributes:
         server: viser's server.
@@ -63,12 +63,12 @@ class Page:
     """
 
     def __init__(self, host: str, port: int, label: str, preview: Image.Image | None = None) -> None:
-        found = free_port(host, port)
+        free = free_port(host, port)
         with (
             guarded_server(Guard(host)),
             contextlib.redirect_stdout(io.StringIO()),  # viser prints a table of addresses; we print one line
         ):
-            self.server = viser.ViserServer(host=host, port=found, label=label, verbose=False)
+            self.server = viser.ViserServer(host=host, port=free, label=label, verbose=False)
         self.port = int(self.server.get_port())
         self._host = "localhost" if host in ("0.0.0.0", "127.0.0.1", "::") else f"[{host}]" if ":" in host else host
         # The button would share the run on the internet through another server.

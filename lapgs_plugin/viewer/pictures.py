@@ -22,7 +22,7 @@ DIVIDER_PIXELS = 2
 
 
 class TimedRasterizer(Rasterizer):
-    """A rasterizer that records the milliseconds of each field, in the order of rendering."""
+    """Record the milliseconds in which a rasterizer renders each field, in the order of rendering."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._rasterizer = rasterizer
@@ -93,7 +93,7 @@ class ShownRun:
         return self._finished(math.floor(octaves + 1e-6))  # tolerates rounding for a window of exactly half the size
 
     def level_for(self, settings: PictureSettings, window: Camera, distance: float) -> int:
-        """Return the finest level to add: the chosen one, or the one that fits the window; the nearest finished."""
+        """Return the finest level to add: the finished one nearest to the chosen one or to `fitting_level`."""
         return self.fitting_level(window, distance) if settings.level is None else self._finished(settings.level)
 
     def _finished(self, level: int) -> int:

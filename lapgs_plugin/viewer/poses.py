@@ -1,7 +1,7 @@
 """Describe camera poses of clients, and convert between viser's cameras and ours.
 
-Both have OpenCV's axes; viser keeps the camera's pose, we keep its inverse. viser is imported where it is used, because
-a training without it also saves a preview.
+Both have OpenCV's axes; viser keeps the camera's pose, we keep its inverse. viser is imported in functions, because a
+training without it also saves a preview.
 """
 
 from __future__ import annotations

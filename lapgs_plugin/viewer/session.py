@@ -26,8 +26,12 @@ MAX_SIDE = 2048
 
 PATH_FILE = "path.json"
 
-HANDLE_DEPTH, HANDLE_HEIGHT, HANDLE_RADIUS = 10.0, 0.5, 0.03
-"""Ball on the divider: depth in units of the near plane; height and radius in units of half the window's height."""
+HANDLE_DEPTH = 10.0
+"""Depth of the ball on the divider in units of the near plane."""
+HANDLE_HEIGHT = 0.5
+"""Height of the ball over the middle in units of half the window's height."""
+HANDLE_RADIUS = 0.03
+"""Radius of the ball in units of half the window's height."""
 
 JPEG_MOVING, JPEG_STILL = 75, 92
 REPORT_SECONDS = 0.3
@@ -36,7 +40,7 @@ REPORT_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """What all clients see: a run, perhaps another one to compare it with, and the scene's cameras if known."""
+    """The content of all clients' pages: a run, a second one to compare it with, and the scene's cameras if known."""
 
     run: ShownRun
     other: ShownRun | None
@@ -59,7 +63,7 @@ class PictureBudget:
 
 
 class Session:
-    """A connected client. viser's threads call its callbacks, the viewer's thread draws its pictures.
+    """Handle a connected client. viser's threads call its callbacks, the viewer's thread draws its pictures.
 
     Args:
         client: viser's handle.

@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class Viewer:
-    """Draws for any number of clients, one picture after the other, in the calling thread.
+    """Draw for any number of clients, one picture after the other, in the calling thread.
 
     Args:
         page: the page; clients may be connected already.
@@ -77,7 +77,7 @@ class Viewer:
                 at_rest = None
 
     def draw_next(self, patience: float) -> bool:
-        """Draw for the client that has waited longest; False when none needed a picture for `patience` seconds."""
+        """Draw for the client that has waited longest; False if none needed a picture within `patience` seconds."""
         session = self._next_session(patience)
         if session is not None:
             self._draw(session)
@@ -96,10 +96,10 @@ class Viewer:
         except Exception:
             logger.exception("a picture could not be drawn; that browser gets no more until its page is loaded again")
             with self._awake:
-                self._sessions = {each: other for each, other in self._sessions.items() if other is not session}
+                self._sessions = {number: other for number, other in self._sessions.items() if other is not session}
 
     def _next_session(self, patience: float) -> Session | None:
-        """Return the client that has waited longest; None when none needed a picture for `patience` seconds."""
+        """Return the client that has waited longest; None if none needed a picture within `patience` seconds."""
         deadline = time.perf_counter() + patience
         with self._awake:
             while True:
