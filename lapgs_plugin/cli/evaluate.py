@@ -124,14 +124,14 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
 
 def _print(metrics: dict[str, Any]) -> None:
     console = make_console()
-    _print_views(console, metrics)
+    print_views(console, metrics)
     _print_levels(console, metrics)
     if metrics["breakdown_seconds"]:
         _print_breakdown(console, metrics)
     _print_summary(console, metrics)
 
 
-def _print_views(console: Console, metrics: dict[str, Any]) -> None:
+def print_views(console: Console, metrics: dict[str, Any]) -> None:
     from rich.markup import escape
 
     from lapgs_plugin.evaluation.lpips import lpips_titles

@@ -53,10 +53,10 @@ def prepare(
         f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, {error}"
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
-    say(f"next: {_next_command(out, result.registered)}")
+    say(f"next: {next_command(out, result.registered)}")
 
 
-def _next_command(out: Path, registered: Sequence[str]) -> str:
+def next_command(out: Path, registered: Sequence[str]) -> str:
     """Return the command that trains the scene. It has options for minutes where a CPU would take hours."""
     from lapgs_plugin.scenes.images import image_size
     from lapgs_plugin.scenes.prepare.photos import target_name

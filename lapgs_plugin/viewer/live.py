@@ -44,6 +44,11 @@ PAUSE_POLL_SECONDS = 0.1
 class LiveView(Watcher):
     """Show a run to all clients of a page. Close the page after the run.
 
+    Attributes:
+        viewer: draws for the clients.
+        percent, pause: controls of the page.
+        failed: whether an error has ended the view.
+
     Args:
         page: the page.
         device: of rendering, see `rasterizer_for`.
@@ -51,8 +56,8 @@ class LiveView(Watcher):
 
     def __init__(self, page: Page, device: str = "auto") -> None:
         self._page, self._device = page, device
-        self._viewer = Viewer(page, LIVE_BUDGET)
-        self._failed = False
+        self.viewer = Viewer(page, LIVE_BUDGET)
+        self.failed = False
         self._archive: RunArchive | None = None
         self._placed: PlacedRasterizer | None = None
         self._cameras: SceneCameras | None = None
@@ -61,7 +66,7 @@ class LiveView(Watcher):
         self._credit, self._counted = 0.0, time.perf_counter()  # seconds for pictures, and the time of that balance
         gui = page.server.gui
         with gui.add_folder("Training"):
-            self._percent = gui.add_slider(
+            self.percent = gui.add_slider(
                 "percent of training time",
                 min=0.0,
                 max=MAX_PERCENT,
@@ -69,7 +74,7 @@ class LiveView(Watcher):
                 initial_value=DEFAULT_PERCENT,
                 hint="share of the training time for pictures",
             )
-            self._pause = gui.add_checkbox("pause training", initial_value=False)
+            self.pause = gui.add_checkbox("pause training", initial_value=False)
 
     def run_started(self, archive: RunArchive) -> None:
         with self._log_errors():
@@ -81,7 +86,7 @@ class LiveView(Watcher):
             except LapgsError as error:
                 logger.info("shown without the scene's cameras: %s", error)
             else:
-                self._viewer.set_initial_view(self._cameras.start)
+                self.viewer.set_initial_view(self._cameras.start)
                 self._begun = True
 
     def stage_started(self, stage: Stage) -> None:
@@ -89,15 +94,15 @@ class LiveView(Watcher):
             self._page.status = f"level {stage.level} begins"
 
     def wants_look(self) -> bool:
-        if self._failed:
+        if self.failed:
             return False
-        share, now = self._percent.value / 100.0, time.perf_counter()
+        share, now = self.percent.value / 100.0, time.perf_counter()
         self._credit = min(self._credit + share * (now - self._counted), MAX_CREDIT)
         self._counted = now
-        if not self._viewer.watched:
-            self._viewer.clear()  # frees the memory of its fields
+        if not self.viewer.watched:
+            self.viewer.clear()  # frees the memory of its fields
             return False
-        return self._pause.value or (share > 0.0 and self._credit > 0.0)
+        return self.pause.value or (share > 0.0 and self._credit > 0.0)
 
     def look(
         self,
@@ -110,17 +115,17 @@ class LiveView(Watcher):
         begin = time.perf_counter()
         with self._log_errors():
             self._show(stage, iteration, fields())
-            self._viewer.draw_next(patience=0.0)
+            self.viewer.draw_next(patience=0.0)
             self._credit -= time.perf_counter() - begin
-            while self._pause.value and self._viewer.watched and not interrupted():
-                self._viewer.draw_next(PAUSE_POLL_SECONDS)
+            while self.pause.value and self.viewer.watched and not interrupted():
+                self.viewer.draw_next(PAUSE_POLL_SECONDS)
         self._counted = time.perf_counter()
 
     def stage_finished(self, stage: Stage, fields: Callable[[], Mapping[int, GaussianField]]) -> None:
         with self._log_errors():
             # Keep finished fields off the GPU while no client is connected.
             self._finished = {level: field.to("cpu") for level, field in {**self._finished, **fields()}.items()}
-            self._viewer.clear()
+            self.viewer.clear()
             self._page.status = f"level {stage.level} is finished"
 
     def _show(self, stage: Stage, iteration: int, fields: Mapping[int, GaussianField]) -> None:
@@ -131,11 +136,11 @@ class LiveView(Watcher):
         shown = {**self._finished, **{level: field.to(device) for level, field in fields.items()}}
         renderer = HierarchyRenderer.of(manifest, shown, self._placed.rasterizer)
         if not self._begun:
-            self._viewer.set_initial_view(InitialView.of_field(shown[manifest.levels - 1]))
+            self.viewer.set_initial_view(InitialView.of_field(shown[manifest.levels - 1]))
             self._begun = True
         rig = None if self._cameras is None else self._cameras.rig
         run = ShownRun.of(self._archive.name, renderer, rig)
-        self._viewer.show(ViewerContent(run, None, self._cameras))
+        self.viewer.show(ViewerContent(run, None, self._cameras))
         self._page.status = (
             f"training level {stage.level} of {manifest.levels}: iteration {iteration:,} of {stage.iterations:,}, "
             f"{len(shown[stage.level]):,} Gaussians"
@@ -147,6 +152,6 @@ class LiveView(Watcher):
         try:
             yield
         except Exception as error:
-            if not self._failed:
+            if not self.failed:
                 logger.warning("the view has ended, training continues: %s", error, exc_info=True)
-            self._failed = True
+            self.failed = True

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from lapgs_plugin.cli.app import run as command_line
-from lapgs_plugin.cli.evaluate import _print_views
+from lapgs_plugin.cli.evaluate import print_views
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene
 
@@ -107,7 +107,7 @@ def test_the_table_of_views_prints_names_as_they_are_spelt(capsys: pytest.Captur
     from rich.console import Console
 
     view = {"name": "[red]a\x1b[2J\nb.png", "psnr": 20.0, "fitted_psnr": 20.0, "ssim": 0.5}
-    _print_views(Console(file=sys.stdout, width=100), {"views": [view], "lpips_missing": {}})
+    print_views(Console(file=sys.stdout, width=100), {"views": [view], "lpips_missing": {}})
     assert r"[red]a\x1b[2J\nb.png" in capsys.readouterr().out
 
 

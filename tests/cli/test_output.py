@@ -70,7 +70,7 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
     monkeypatch.chdir(tmp_path)
     Path("desk/images/left").mkdir(parents=True)
     Image.new("L", size).save("desk/images/left/a.png")
-    command = prepare._next_command(Path("desk"), ["left/a.webp", *(f"left/{i}.webp" for i in range(24))])
+    command = prepare.next_command(Path("desk"), ["left/a.webp", *(f"left/{i}.webp" for i in range(24))])
     assert command == f"lapgs train desk -o runs/desk --eval{options}"
 
 

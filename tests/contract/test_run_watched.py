@@ -95,7 +95,7 @@ def test_the_viewer_shows_a_checkout_on_the_cpu(scene: Path, tmp_path: Path) -> 
 
     with Page("127.0.0.1", 8950, "run") as page:
         watcher = LiveView(page, "cpu")
-        watcher._percent.value = 50.0
+        watcher.percent.value = 50.0
         words, pictures = list[str](), list[int]()
 
         def look() -> None:
@@ -115,4 +115,4 @@ def test_the_viewer_shows_a_checkout_on_the_cpu(scene: Path, tmp_path: Path) -> 
         thread.join(30)
     assert pictures[0] >= 2
     assert any("training level 0 of 2: iteration" in text for text in words)
-    assert not watcher._failed
+    assert not watcher.failed

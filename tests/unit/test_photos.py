@@ -444,7 +444,7 @@ def test_cameras_of_a_database_get_one_focal_length(tmp_path: Path) -> None:
             model="OPENCV", width=80, height=64, params=[90, 110, 40, 32, 0.1, 0, 0, 0], camera_id=1
         )
         database.write_camera(camera, use_camera_id=True)
-    colmap_worker._replace_cameras(str(path), "RADIAL")
+    colmap_worker.replace_cameras(str(path), "RADIAL")
     with pycolmap.Database.open(path) as database:
         (camera,) = database.read_all_cameras()
     assert (camera.camera_id, camera.model.name, camera.width, camera.height) == (1, "RADIAL", 80, 64)

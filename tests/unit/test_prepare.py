@@ -206,7 +206,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out = tmp_path / "scene"
-    rows = colmap._rows
+    rows = colmap.count_rows
 
     def interrupted_rows(file: Path, table: str) -> int:
         done = rows(file, table)
@@ -215,7 +215,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
         return done
 
     monkeypatch.setattr(colmap, "POLL_SECONDS", 0.02)
-    monkeypatch.setattr(colmap, "_rows", interrupted_rows)
+    monkeypatch.setattr(colmap, "count_rows", interrupted_rows)
     for interrupted in ("descriptors", "two_view_geometries"):
         with pytest.raises(KeyboardInterrupt):
             prepare_scene(photos, out, progress=True)
@@ -285,7 +285,7 @@ def test_few_features_are_mapped_by_one_thread(
     monkeypatch.setattr(pycolmap.Database, "open", lambda path: nullcontext(database))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **callbacks: used.append(args[3].num_threads))
     job = {"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed"), "mapper": "incremental"}
-    colmap_worker._map(job)
+    colmap_worker.map_photos(job)
     assert used == [threads]
 
 
@@ -332,7 +332,7 @@ def test_photos_of_nothing_in_common_are_an_error_and_a_scene_that_is_there_stay
     with sqlite3.connect(out / ".prepare" / "database.db") as database:
         compared = database.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
     assert compared == 13 + 12 + 10 + 6  # 1, 2, 4 and 8 photos ahead
-    assert colmap._neighbour_pairs(14) == compared  # what the progress bar counts to
+    assert colmap.neighbour_pairs(14) == compared  # what the progress bar counts to
     shutil.rmtree(out / ".prepare")
     assert snapshot(out) == snapshot(prepared[0])
 

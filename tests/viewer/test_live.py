@@ -74,7 +74,7 @@ def watched_run(
     thread.start()
     try:
         with wire_client(page.address) as client:
-            wait_for(lambda: watcher._viewer.watched)
+            wait_for(lambda: watcher.viewer.watched)
             watcher.go.set()
             client_does(client)
     finally:
@@ -97,7 +97,7 @@ def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(
     page: Page, tmp_path: Path, hierarchy: str
 ) -> None:
     watcher = Watched(page)
-    watcher._percent.value = 50.0
+    watcher.percent.value = 50.0
 
     def look(client: WireClient) -> None:
         wait_for(lambda: client.listen(0.05) > 0 and any("training level 0 of 2" in text for text in client.words))
@@ -110,12 +110,12 @@ def test_pictures_of_every_stage_come_and_the_result_has_the_same_bits(
 
 def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: Path) -> None:
     watcher = Watched(page)
-    watcher._percent.value = 50.0
+    watcher.percent.value = 50.0
 
     def look(client: WireClient) -> None:
         assert client.listen(PATIENCE, pictures=1) == 1
         client.connection.close()
-        wait_for(lambda: not watcher._viewer.watched)
+        wait_for(lambda: not watcher.viewer.watched)
         with wire_client(page.address) as again:
             assert again.listen(PATIENCE, pictures=1) == 1
 
@@ -124,7 +124,7 @@ def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: 
 
 def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, tmp_path: Path) -> None:
     watcher = Watched(page)
-    watcher._pause.value = True
+    watcher.pause.value = True
 
     def look(client: WireClient) -> None:
         assert client.listen(PATIENCE, pictures=1) == 1
@@ -133,19 +133,19 @@ def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, 
         client.look_from(0.5, 0.0, -4.0)  # pictures arrive while training is paused
         assert client.listen(PATIENCE, pictures=1) == 1
         assert page.status == status
-        watcher._pause.value = False
+        watcher.pause.value = False
         wait_for(lambda: client.listen(0.05) >= 0 and "iteration 1 of" not in page.status)
-        watcher._pause.value = True
+        watcher.pause.value = True
 
     watched_run(tmp_path / "run", page, watcher, look)  # it ends although it is paused: the client has left
 
 
 def test_training_can_be_stopped_while_paused(page: Page) -> None:
     watcher = LiveView(page)
-    watcher._pause.value = True
+    watcher.pause.value = True
     asked: list[bool] = []
     with wire_client(page.address):
-        wait_for(lambda: watcher._viewer.watched)
+        wait_for(lambda: watcher.viewer.watched)
         stage = ring_stage()
         watcher._show = lambda *_: None  # type: ignore[method-assign]
         watcher.look(stage, 1, dict, lambda: asked.append(True) or len(asked) > 2)  # type: ignore[func-returns-value]
@@ -165,7 +165,7 @@ def test_a_viewer_that_fails_ends_watching_not_training(
 
     monkeypatch.setattr(Viewer, broken, fail)
     watcher = Watched(page)
-    archive = watched_run(tmp_path / "run", page, watcher, lambda client: wait_for(lambda: watcher._failed), 30)
+    archive = watched_run(tmp_path / "run", page, watcher, lambda client: wait_for(lambda: watcher.failed), 30)
     assert archive.manifest.complete
     assert watcher.looks <= 1
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
@@ -178,10 +178,10 @@ def test_pictures_take_no_more_than_their_share(page: Page, monkeypatch: pytest.
     clock = Clock()
     monkeypatch.setattr(live.time, "perf_counter", clock)
     watcher = LiveView(page)
-    watcher._percent.value = percent
+    watcher.percent.value = percent
     durations = itertools.cycle([0.001, 0.04, 0.013])
     monkeypatch.setattr(watcher, "_show", lambda *_: clock.sleep(next(durations)))
-    monkeypatch.setattr(watcher._viewer, "draw_next", lambda patience: True)
+    monkeypatch.setattr(watcher.viewer, "draw_next", lambda patience: True)
     monkeypatch.setattr(Viewer, "watched", True)
     looking = training = 0.0
     for iteration in range(20_000):
@@ -201,7 +201,7 @@ def test_a_share_of_zero_draws_nothing(page: Page, monkeypatch: pytest.MonkeyPat
     watcher = LiveView(page)
     monkeypatch.setattr(Viewer, "watched", True)
     assert watcher.wants_look()
-    watcher._percent.value = 0.0
+    watcher.percent.value = 0.0
     assert not watcher.wants_look()
 
 

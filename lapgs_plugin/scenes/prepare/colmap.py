@@ -81,7 +81,7 @@ def find_features(job: Job, single_camera: bool) -> None:
         "max_size": job.settings.max_size,
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
-    phase = Phase("Finding features", "photos", len(job.names), lambda: _rows(job.database, "descriptors"))
+    phase = Phase("Finding features", "photos", len(job.names), lambda: count_rows(job.database, "descriptors"))
     _run_step(job, "features", options, [phase])
 
 
@@ -90,10 +90,10 @@ def match_pairs(job: Job) -> None:
     count, loops, matcher = len(job.names), _loops(job), chosen_matcher(job)
     total = {
         EXHAUSTIVE: count * (count - 1) // 2,
-        SEQUENTIAL: _neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
+        SEQUENTIAL: neighbour_pairs(count) + loops * LOOP_SIMILAR,  # at most
         RETRIEVAL: count * min(SIMILAR, count - 1),  # at most: many pairs are found from both sides
     }[matcher]
-    phases = [Phase("Matching pairs", "pairs", total, lambda: _rows(job.database, "two_view_geometries"))]
+    phases = [Phase("Matching pairs", "pairs", total, lambda: count_rows(job.database, "two_view_geometries"))]
     if matcher == RETRIEVAL or (matcher == SEQUENTIAL and loops):
         indexed = re.compile(rb"Indexing image \[(\d+)/")
         phases.insert(0, Phase("Comparing photos", "photos", count, lambda: _logged(job, indexed)))
@@ -118,9 +118,9 @@ def match_more(job: Job) -> Path | None:
         with closing(sqlite3.connect(partial)) as connection, connection:
             # COLMAP matches pairs without a geometry again.
             connection.execute(f"DELETE {known}", (VERIFIED,))
-        before = _rows(partial, "two_view_geometries")
+        before = count_rows(partial, "two_view_geometries")
         options = {**_pairing(job), "database": str(partial.absolute()), "guided": True}
-        phase = Phase("Matching more", "pairs", total, lambda: _rows(partial, "two_view_geometries") - before)
+        phase = Phase("Matching more", "pairs", total, lambda: count_rows(partial, "two_view_geometries") - before)
         _run_step(job, "pairs", options, [phase])
         with closing(sqlite3.connect(partial)) as connection:
             # COLMAP leaves matches in its log if the progress bar reads the database while COLMAP closes it.
@@ -153,7 +153,7 @@ def _loops(job: Job) -> int:
     return -(-len(job.names) // LOOP_EVERY) if len(job.names) >= LOOP_FROM and HAS_VOCABULARY else 0
 
 
-def _neighbour_pairs(count: int) -> int:
+def neighbour_pairs(count: int) -> int:
     """Return the number of pairs in sequential matching: each photo with those 1, 2, 4, 8, ... ahead."""
     return sum(max(0, count - 2**power) for power in range(pycolmap.SequentialPairingOptions().overlap))
 
@@ -206,7 +206,7 @@ def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
     return [pycolmap.Reconstruction(model) for model in sorted(folder.iterdir())]
 
 
-def _rows(database: Path, table: str) -> int:
+def count_rows(database: Path, table: str) -> int:
     """Return the number of rows in a table of COLMAP's database, also while COLMAP writes it; 0 before it exists."""
     try:
         uri = f"{database.absolute().as_uri()}?mode=ro"

@@ -38,7 +38,7 @@ def main() -> None:
     pycolmap.logging.logtostderr = True  # and not to files in /tmp as well
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    {"features": _find_features, "pairs": _match_pairs, "map": _map}[job["step"]](job)
+    {"features": find_features, "pairs": match_pairs, "map": map_photos}[job["step"]](job)
 
 
 def _end_with_parent() -> None:
@@ -46,7 +46,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _find_features(job: dict[str, Any]) -> None:
+def find_features(job: dict[str, Any]) -> None:
     """Extract features. Keys: database, photos, names, camera_model, single_camera, max_size and masks (or None)."""
     mode = pycolmap.CameraMode.SINGLE if job["single_camera"] else pycolmap.CameraMode.AUTO
     reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
@@ -67,7 +67,7 @@ def _find_features(job: dict[str, Any]) -> None:
     pycolmap.extract_features(job["database"], job["photos"], job["names"], mode, reader, options)
 
 
-def _match_pairs(job: dict[str, Any]) -> None:
+def match_pairs(job: dict[str, Any]) -> None:
     """Match features.
 
     Keys: database, matcher, similar (photos to compare with by looks), every (distance of photos that sequential
@@ -112,14 +112,14 @@ def _make_tree(database: str, tree: str) -> None:
     index.write(tree)
 
 
-def _map(job: dict[str, Any]) -> None:
+def map_photos(job: dict[str, Any]) -> None:
     """Recover models.
 
     Keys: database, photos, models (an empty folder), placed (a file that gets a line per model, a byte per photo),
     mapper ("incremental" or "global"), camera_model (to fit instead of the database's; may be missing).
     """
     if "camera_model" in job:
-        _replace_cameras(job["database"], job["camera_model"])
+        replace_cameras(job["database"], job["camera_model"])
     if job["mapper"] == "global":
         whole = pycolmap.GlobalPipelineOptions(random_seed=SEED)
         pycolmap.global_mapping(job["database"], job["photos"], job["models"], whole)
@@ -148,7 +148,7 @@ def _map(job: dict[str, Any]) -> None:
         )
 
 
-def _replace_cameras(path: str, model: str) -> None:
+def replace_cameras(path: str, model: str) -> None:
     """Give the cameras of a database another model without distortion, and the same focal length."""
     with pycolmap.Database.open(path) as database:
         for camera in database.read_all_cameras():
