@@ -176,7 +176,7 @@ def places(tmp_path: Path) -> dict[str, str]:
     return {name: str(path) for name, path in named.items()}
 
 
-@pytest.mark.parametrize(("wrong", "advice", "right"), ADVICE, ids=[each[0][:50] for each in ADVICE])
+@pytest.mark.parametrize(("wrong", "advice", "right"), ADVICE, ids=[line[0][:50] for line in ADVICE])
 def test_who_follows_the_advice_gets_further(
     wrong: str, advice: str, right: list[str], places: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,8 +59,8 @@ def work(
     plain: Annotated[int, typer.Option(help="Declared in the signature.")] = 3,
 ) -> None:
     """Work on TARGET."""
-    given = given_options(context)
-    CALLS.append({"target": target, "settings": settings, "extra": extra, "plain": plain, "given": given})
+    names = given_options(context)
+    CALLS.append({"target": target, "settings": settings, "extra": extra, "plain": plain, "given": names})
 
 
 def _run(*words: str) -> Result:
@@ -124,8 +124,8 @@ def test_help_shows_names_defaults_bounds_and_panels() -> None:
     lines = [line.strip("│ ") for line in _run("--help").output.splitlines()]
 
     def line(name: str) -> str:
-        (found,) = (line for line in lines if line.startswith(name))
-        return found
+        (row,) = (line for line in lines if line.startswith(name))
+        return row
 
     assert "Work on TARGET." in lines
     assert "--gather" in line("--accumulate-views")

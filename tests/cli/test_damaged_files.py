@@ -212,13 +212,13 @@ def test_a_full_disk_is_no_reason_to_resume(run: Path, command: str, monkeypatch
     assert "--resume" not in str(caught.value)
 
 
-@pytest.mark.parametrize("place", ["level_0", "level_0/point_cloud.ply", MANIFEST])
-def test_what_may_not_be_looked_at_is_one_line(run: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("file", ["level_0", "level_0/point_cloud.ply", MANIFEST])
+def test_what_may_not_be_looked_at_is_one_line(run: Path, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As chmod 0 has it; root may look everywhere."""
 
     def denied(real: Callable[..., Any]) -> Callable[..., Any]:
         def call(path: Any, *arguments: Any, **options: Any) -> Any:
-            if str(path).startswith(str(run / place)):
+            if str(path).startswith(str(run / file)):
                 raise PermissionError(13, "Permission denied", str(path))
             return real(path, *arguments, **options)
 
@@ -227,7 +227,7 @@ def test_what_may_not_be_looked_at_is_one_line(run: Path, place: str, monkeypatc
     for owner, name in ((Path, "stat"), (Path, "open"), (os, "open")):
         monkeypatch.setattr(owner, name, denied(getattr(owner, name)))
     for command in ("export", "render", "eval"):
-        refused(rf"{run / place}.*Permission denied|Permission denied", command, run)
+        refused(rf"{run / file}.*Permission denied|Permission denied", command, run)
 
 
 @pytest.mark.parametrize(

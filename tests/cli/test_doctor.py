@@ -42,8 +42,8 @@ def test_json_names_every_section_and_this_machine_can_train(monkeypatch: pytest
     assert "CPU rasterizer" in sections["lapgs train"][0]["detail"]
     assert sections["Backbones"][-1]["name"] == "Current folder"
     assert "FastGS" in sections["Backbones"][-1]["detail"]
-    for found in sections.values():
-        for finding in found:
+    for section in sections.values():
+        for finding in section:
             assert finding["status"] in ("ok", "absent", "problem")
             assert "\n" not in finding["detail"]
 
@@ -54,13 +54,13 @@ def test_entry_points_of_packages_are_listed_and_misspelt_groups_found(
     entries = "[lapgs_plugin.hooks]\nsmooth = tiny:Smooth\n[lapgs_plugin.rasterizers]\ndiscs = tiny:Discs\n"
     entries += "[lapgs.commands]\nhello = tiny:app\n"
     install_package(tmp_path, monkeypatch, "tiny", f"{entries}[lapgs_plugin.strategy]\nopaque = tiny:OPAQUE\n", "")
-    found = {finding.name: finding for finding in findings.entry_point_findings()}
-    assert found["smooth"].detail == "a hook, part of every run: tiny:Smooth of tiny 1.0"
-    assert found["discs"].detail == "--rasterizer discs: tiny:Discs of tiny 1.0"
-    assert found["opaque"].status == "problem"
-    assert "lapgs_plugin.strategy, which nothing reads" in found["opaque"].detail
-    assert found["hello"].detail == "lapgs hello: tiny:app of tiny 1.0"
-    assert "bench" not in found, "it is of this package"
+    by_name = {finding.name: finding for finding in findings.entry_point_findings()}
+    assert by_name["smooth"].detail == "a hook, part of every run: tiny:Smooth of tiny 1.0"
+    assert by_name["discs"].detail == "--rasterizer discs: tiny:Discs of tiny 1.0"
+    assert by_name["opaque"].status == "problem"
+    assert "lapgs_plugin.strategy, which nothing reads" in by_name["opaque"].detail
+    assert by_name["hello"].detail == "lapgs hello: tiny:app of tiny 1.0"
+    assert "bench" not in by_name, "it is of this package"
     assert {*(registry.group for registry in REGISTRIES), HOOKS} == set(findings.ENTRY_POINT_GROUPS)
 
 
@@ -103,8 +103,10 @@ def test_what_training_will_use(
     detail: str,
 ) -> None:
     """As `choose_rasterizer` has it: a GPU that cannot be used stands in the way, unless it is hidden."""
-    found = Probe({**TORCH, **facts})
-    monkeypatch.setattr(probes, "run_probe", lambda *given: found if given == ("torch",) else probed(*given))
+    probe = Probe({**TORCH, **facts})
+    monkeypatch.setattr(
+        probes, "run_probe", lambda *arguments: probe if arguments == ("torch",) else probed(*arguments)
+    )
     monkeypatch.setattr(environment, "driver_version", lambda: driver)
     monkeypatch.setattr(findings, "gsplat_built", lambda: built)
     monkeypatch.setattr(findings, "triton_missing", lambda: triton)

@@ -84,10 +84,10 @@ def test_an_antialiased_run_is_merged_without_a_gpu(tmp_path: Path, monkeypatch:
 
 def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its opacities and sizes are right already, and nothing is to shake the positions."""
-    found = []
+    settled = []
 
     def capture(run: PreparedRun, **_: Any) -> None:
-        found.append(run.settings.densification.options)
+        settled.append(run.settings.densification.options)
         raise UserInputError("far enough")
 
     monkeypatch.setattr(merge, "Trainer", capture)
@@ -95,8 +95,8 @@ def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, m
     for iterations in (3_000, 30_000):
         with pytest.raises(UserInputError, match="far enough"):
             merge.merge_levels(archive, iterations=iterations)
-    assert found[0] == found[1]
-    assert (found[0].opacity_weight, found[0].scale_weight) == (0.0, 0.0)
+    assert settled[0] == settled[1]
+    assert (settled[0].opacity_weight, settled[0].scale_weight) == (0.0, 0.0)
 
 
 def test_the_first_field_has_base_and_refined_residuals(tmp_path: Path) -> None:

@@ -19,15 +19,15 @@ HEAVY = ("torch", "numba", "numpy", "pycolmap", "OpenImageIO", "gsplat", "cv2", 
 
 def _commands() -> list[list[str]]:
     """Words of every command, groups included."""
-    found: list[list[str]] = [[]]
+    names: list[list[str]] = [[]]
 
     def visit(command: Any, words: list[str]) -> None:
-        for name, each in getattr(command, "commands", {}).items():
-            found.append([*words, name])
-            visit(each, [*words, name])
+        for name, below in getattr(command, "commands", {}).items():
+            names.append([*words, name])
+            visit(below, [*words, name])
 
     visit(all_commands(), [])
-    return found
+    return names
 
 
 COMMANDS = _commands()
@@ -43,11 +43,11 @@ print(json.dumps({"codes": codes, "modules": sorted(sys.modules)}))
 
 def test_help_of_all_commands_imports_nothing_heavy() -> None:
     arguments = [sys.executable, "-c", SCRIPT, json.dumps(COMMANDS)]
-    found = json.loads(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+    shown = json.loads(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
     assert len(COMMANDS) >= 20
-    assert found["codes"] == [0] * len(COMMANDS)
-    assert "typer" in found["modules"]
-    assert not set(HEAVY) & set(found["modules"])
+    assert shown["codes"] == [0] * len(COMMANDS)
+    assert "typer" in shown["modules"]
+    assert not set(HEAVY) & set(shown["modules"])
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
@@ -59,8 +59,8 @@ def test_first_line_is_a_sentence_and_every_option_is_described(words: list[str]
     assert first[0].isupper()
     assert first.endswith(".")
     assert len(first) <= 110
-    described = [each for each in command.params if each.name not in ("help", "install_completion")]
-    assert [each.name for each in described if not each.help] == []
+    described = [parameter for parameter in command.params if parameter.name not in ("help", "install_completion")]
+    assert [parameter.name for parameter in described if not parameter.help] == []
     shown = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*words, "--help"]).output
     assert first in " ".join(shown.split())
 

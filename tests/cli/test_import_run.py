@@ -62,8 +62,8 @@ class Foreign:
         text = ", ".join(f"{name}={value!r}" for name, value in values.items())
         (self.folder / "cfg_args").write_text(f"Namespace({text})")
 
-    def field(self, place: str, iteration: int, field: GaussianField) -> GaussianField:
-        path = self.folder / place / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+    def field(self, folder: str, iteration: int, field: GaussianField) -> GaussianField:
+        path = self.folder / folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
         path.parent.mkdir(parents=True)
         replace(field, signed=False).save_ply(path)  # their files lack our mark
         return field
@@ -77,9 +77,9 @@ class Foreign:
 
 @pytest.fixture
 def foreign(tmp_path: Path, scene: Path) -> Foreign:
-    made = Foreign(tmp_path / "output", scene)
-    made.options()
-    return made
+    output = Foreign(tmp_path / "output", scene)
+    output.options()
+    return output
 
 
 def release_up(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -118,12 +118,12 @@ def test_filters_of_mip_splatting_are_applied(foreign: Foreign, tmp_path: Path) 
     data = PlyData.read(path)["vertex"].data
     PlyData([PlyElement.describe(append_fields(data, "filter_3D", filters, usemask=False), "vertex")]).write(path)
     lapgs("import-run", foreign.folder, "-o", tmp_path / "run", "--backbone", "mip_splatting")
-    found = RunArchive.open(tmp_path / "run").field(0)
+    imported = RunArchive.open(tmp_path / "run").field(0)
     before = field.log_scales.double().exp().square()
     after = before + torch.from_numpy(filters).double().square()[:, None]
-    torch.testing.assert_close(found.log_scales.double(), after.sqrt().log(), atol=1e-5, rtol=0)  # 1.6e-7 seen
+    torch.testing.assert_close(imported.log_scales.double(), after.sqrt().log(), atol=1e-5, rtol=0)  # 1.6e-7 seen
     opacities = field.opacity_logits.double().sigmoid() * (before.prod(1) / after.prod(1)).sqrt()
-    torch.testing.assert_close(found.opacity_logits.double().sigmoid(), opacities, atol=1e-5, rtol=0)  # 2.2e-7 seen
+    torch.testing.assert_close(imported.opacity_logits.double().sigmoid(), opacities, atol=1e-5, rtol=0)  # 2.2e-7 seen
     assert opacities[-1] < 0.9 * field.opacity_logits[-1].sigmoid()
 
 
@@ -132,8 +132,8 @@ def test_opacities_that_taming_3dgs_saves_as_they_are(foreign: Foreign, tmp_path
     stored = torch.linspace(-0.1, 1.2, 90)
     foreign.field("", 700, replace(blob_field(90, seed=1), opacity_logits=stored))
     lapgs("import-run", foreign.folder, "-o", tmp_path / "run", "--backbone", "taming")
-    found = RunArchive.open(tmp_path / "run").field(0).opacity_logits.sigmoid()
-    torch.testing.assert_close(found, stored.abs().clamp(max=1), atol=1e-5, rtol=0)  # 1.1e-6 seen
+    opacities = RunArchive.open(tmp_path / "run").field(0).opacity_logits.sigmoid()
+    torch.testing.assert_close(opacities, stored.abs().clamp(max=1), atol=1e-5, rtol=0)  # 1.1e-6 seen
 
 
 def test_figures_of_the_release_count_from_its_first_stage(foreign: Foreign, tmp_path: Path) -> None:

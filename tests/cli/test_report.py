@@ -46,13 +46,13 @@ class Page(HTMLParser):
         assert self._open == []
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attributes}
-        self.tags.append((tag, given))
+        values = {name: value or "" for name, value in attributes}
+        self.tags.append((tag, values))
         if tag not in VOID:
             self._open.append(tag)
-        self._row = given.get("data-metric", self._row) if tag == "tr" else self._row
-        if tag == "td" and given.get("data-value") and self._row:
-            self.figures.setdefault(self._row, []).append(float(given["data-value"]))
+        self._row = values.get("data-metric", self._row) if tag == "tr" else self._row
+        if tag == "td" and values.get("data-value") and self._row:
+            self.figures.setdefault(self._row, []).append(float(values["data-value"]))
 
     def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         assert tag in VOID, f"<{tag}/> closes nothing in HTML"
@@ -145,12 +145,12 @@ def test_figures_are_those_of_metrics_json(run: Path, baseline: Path) -> None:
     page = Page((run / "report.html").read_text())
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (run, baseline)]
     for key in ("psnr", "ssim", "train_seconds", "peak_gaussians"):
-        assert page.figures[key] == [each[key] for each in metrics]
+        assert page.figures[key] == [figures[key] for figures in metrics]
     for key in ("num_gaussians", "overhead_seconds"):
-        assert page.figures[key] == [sum(each[key].values()) for each in metrics]
-    for each in metrics:
-        assert f"{each['psnr']:.2f}" in page.text
-        assert f"{each['psnr']:.2f}" in output
+        assert page.figures[key] == [sum(figures[key].values()) for figures in metrics]
+    for figures in metrics:
+        assert f"{figures['psnr']:.2f}" in page.text
+        assert f"{figures['psnr']:.2f}" in output
     missing = bool(metrics[0]["lpips_missing"])  # unless this machine has the weights
     assert (output.count("not measured"), page.text.count("lapgs eval says how")) == (missing, missing)
     ratio = f"{metrics[1]['train_seconds'] / metrics[0]['train_seconds']:.2f}x as fast"
@@ -196,14 +196,14 @@ def test_views_are_listed_worst_first_beside_the_baseline(run: Path, baseline: P
     text = (run / "report.html").read_text()
     table = text.partition('<table class="numbers views"')[2].partition("</table>")[0]
     rows = [re.findall(r'<th>(.*?)</th>|data-value="(.*?)"', row) for row in table.split("<tr>")[2:]]
-    found = [(row[0][0], *(float(value) for _, value in row[1:])) for row in rows]
+    cells = [(row[0][0], *(float(value) for _, value in row[1:])) for row in rows]
     metrics = [json.loads((folder / "metrics.json").read_text())["views"] for folder in (run, baseline)]
     theirs = {view["name"]: view["psnr"] for view in metrics[1]}
     expected = [
         (v["name"], v["psnr"], v["ssim"], theirs[v["name"]], v["psnr"] - theirs[v["name"]])
         for v in sorted(metrics[0], key=lambda view: view["psnr"])
     ]
-    assert found == expected
+    assert cells == expected
     assert re.findall(r"<th>([^<]*)</th>", table)[:5] == ["view", "PSNR (dB)", "SSIM", "baseline PSNR", "gain"]
 
 

@@ -32,7 +32,7 @@ def test_a_camera_that_stands_still_sees_no_flicker(scene: Path, tmp_path: Path)
     assert figures["size"] == [camera.width, camera.height]
     assert figures["baseline"] == str(single)
     assert list(figures["flicker"]) == ["composition", "band 1", "band 0", "single field"]
-    assert all(each["mean"] < 1e-5 and each["psnr"] > 90 for each in figures["flicker"].values())  # 1e-7, 100 seen
+    assert all(curve["mean"] < 1e-5 and curve["psnr"] > 90 for curve in figures["flicker"].values())  # 1e-7, 100 seen
     for name in figures["flicker"]:
         assert name in output
     assert "stability.json holds these figures" in output

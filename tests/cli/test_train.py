@@ -78,7 +78,7 @@ def test_everything_of_a_run_by_relative_paths(
         ended = lapgs(*command)
         assert ended.returncode == 0, (command, ended.stderr)
         assert str(tmp_path) not in ended.stderr
-    assert [each.name for each in Path("runs").iterdir()] == ["a"]
+    assert [path.name for path in Path("runs").iterdir()] == ["a"]
     assert not Path("runs/a/runs").exists()
 
 

@@ -171,8 +171,8 @@ def test_a_file_that_is_not_there(scene: Path, tmp_path: Path) -> None:
         lapgs("train", scene, "--config", tmp_path / "none.toml", "-o", tmp_path / "run")
     (tmp_path / "loop.toml").symlink_to("loop.toml")
     os.mkfifo(tmp_path / "pipe.toml")
-    for name, what in (("loop.toml", "links"), ("pipe.toml", "a pipe, socket or device"), ("", "directory")):
-        with pytest.raises(UserInputError, match=rf"{re.escape(name)} cannot be read: .*(?i:{what}).*; correct it"):
+    for name, reason in (("loop.toml", "links"), ("pipe.toml", "a pipe, socket or device"), ("", "directory")):
+        with pytest.raises(UserInputError, match=rf"{re.escape(name)} cannot be read: .*(?i:{reason}).*; correct it"):
             lapgs("train", scene, "--config", tmp_path / name, "-o", tmp_path / "run")
 
 

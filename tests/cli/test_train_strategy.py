@@ -129,12 +129,12 @@ def command(**animals: Any) -> Any:
 def test_choices_have_their_own_options_and_those_they_inherit() -> None:
     show = command(tame=Tame(), wild=Wild(size=5))
     assert list(show.__signature__.parameters) == ["animal", "size", "speed"]
-    given = {"animal": "wild", "size": 4, "speed": 7.0}
-    assert show(**given) == {"animal": "wild", "options": {"size": 4, "speed": 7.0}}
+    options = {"animal": "wild", "size": 4, "speed": 7.0}
+    assert show(**options) == {"animal": "wild", "options": {"size": 4, "speed": 7.0}}
     with pytest.raises(UserInputError, match=r"--speed 7\.0 with --animal tame: an option of --animal wild; leave"):
-        show(**{**given, "animal": "tame"})
+        show(**{**options, "animal": "tame"})
     with pytest.raises(UserInputError, match="--animal lame: expected tame or wild"):
-        show(**{**given, "animal": "lame"})
+        show(**{**options, "animal": "lame"})
 
 
 def test_an_option_that_two_choices_declare_is_refused() -> None:

@@ -97,8 +97,8 @@ def test_an_inset_holds_the_start_and_nothing_else() -> None:
     assert chart.inset is not None
     (line,) = chart.inset.lines
     ticks = [float(tick.label) for tick in chart.inset.y_ticks]
-    found = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in line.points]
-    assert found == [pytest.approx(point, abs=0.1) for point in rising[:6]]
+    drawn = [in_data(point, 10.0, ticks[0], ticks[-1], INSET) for point in line.points]
+    assert drawn == [pytest.approx(point, abs=0.1) for point in rising[:6]]
     assert chart.inset.inset is None
     assert draw_lines("t", "x", [Series("run", rising[::10])], inset_until=30.0).inset is None  # two points say no more
 
@@ -139,8 +139,8 @@ coordinates = st.tuples(st.floats(0.0, 1e6), st.floats(0.0, 1e4))
 def test_arrows_begin_and_point_where_the_axes_say(
     ends: list[tuple[tuple[float, float], tuple[float, float]]],
 ) -> None:
-    chart = draw_arrows("t", "x", [Arrow("run", "m", *each) for each in ends], repr)
-    right = max(x for each in ends for x, _ in each) * 1.04 or 1.0
+    chart = draw_arrows("t", "x", [Arrow("run", "m", *pair) for pair in ends], repr)
+    right = max(x for pair in ends for x, _ in pair) * 1.04 or 1.0
     top = float(chart.y_ticks[-1].label)
     for arrow, (start, end) in zip(chart.arrows, ends, strict=True):
         begins, points_at = (

@@ -220,8 +220,8 @@ def test_poses_are_those_of_the_images_not_of_the_frames(tmp_path: Path, kind: s
         assert read.warnings == ()
     else:
         (line,) = read.warnings
-        what = "damaged" if edit == "cut" else "2 of 4 entries"
-        assert re.search(rf"frames\.{kind}: {what}.*; images\.{kind} is used, COLMAP uses the frames", line)
+        difference = "damaged" if edit == "cut" else "2 of 4 entries"
+        assert re.search(rf"frames\.{kind}: {difference}.*; images\.{kind} is used, COLMAP uses the frames", line)
 
 
 def test_images_that_were_numbered_anew_are_none_of_the_frames(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_text_beside_binary_files(tmp_path: Path) -> None:
     for file, text in texts.items():
         file.write_text(text)
     assert read_model(folder).warnings == ()
-    for name, old, new, what in (
+    for name, old, new, difference in (
         ("cameras", "80", "90", "1 of 1 entries"),
         ("images", "b.png", "c.png", "1 of 4 entries"),
         ("images", "4.0 ", "4.5 ", "1 of 4 entries"),
@@ -252,7 +252,7 @@ def test_text_beside_binary_files(tmp_path: Path) -> None:
         file = folder / f"{name}.txt"
         file.write_text(re.sub(old, new, texts[file], count=1))
         (line,) = read_model(folder).warnings
-        assert re.search(rf"{name}\.txt: {what}.*; {name}\.bin is used, remove", line)
+        assert re.search(rf"{name}\.txt: {difference}.*; {name}\.bin is used, remove", line)
         file.write_text(texts[file])
     (folder / "images.bin").unlink()
     (folder / "images.txt").write_text(texts[folder / "images.txt"].replace("b.png", "c.png"))

@@ -21,8 +21,8 @@ def torch_probe(cuda: str | None = None, gpus: tuple[str, ...] = (), complaint: 
     return Probe({"version": "2.6.0", "cuda": cuda, "gpus": list(gpus), "complaint": complaint, "extensions": "none"})
 
 
-def status(found: list[Finding]) -> dict[str, str]:
-    return {finding.name: finding.status for finding in found}
+def status(reported: list[Finding]) -> dict[str, str]:
+    return {finding.name: finding.status for finding in reported}
 
 
 def test_no_gpu_is_no_problem() -> None:
@@ -30,8 +30,8 @@ def test_no_gpu_is_no_problem() -> None:
 
 
 def test_a_usable_gpu_is_named_with_its_driver() -> None:
-    found = findings.torch_findings(torch_probe("12.4", (GPU, GPU)), driver="550.54")
-    assert [finding.detail for finding in found] == ["2.6.0, built for CUDA 12.4", *[f"{GPU}, driver 550.54"] * 2]
+    reported = findings.torch_findings(torch_probe("12.4", (GPU, GPU)), driver="550.54")
+    assert [finding.detail for finding in reported] == ["2.6.0, built for CUDA 12.4", *[f"{GPU}, driver 550.54"] * 2]
 
 
 @pytest.mark.parametrize(
@@ -50,8 +50,8 @@ def test_a_gpu_that_pytorch_cannot_use_is_a_problem_with_advice(probe: Probe, ad
 
 
 def test_broken_pytorch_is_reported_with_its_error() -> None:
-    (found,) = findings.torch_findings(Probe({}, "ImportError: libtorch.so"), driver="")
-    assert (found.status, found.detail) == ("problem", "ImportError: libtorch.so")
+    (finding,) = findings.torch_findings(Probe({}, "ImportError: libtorch.so"), driver="")
+    assert (finding.status, finding.detail) == ("problem", "ImportError: libtorch.so")
 
 
 def test_a_toolkit_of_another_cuda_major_version_is_a_problem(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -89,10 +89,10 @@ def test_packages_missing_old_and_broken() -> None:
         Requirement("no-such-package>=1"),
         Requirement("rich"),
     ]
-    found = findings.package_findings(wanted, {"rich": Probe({}, "ImportError: boom")})
-    assert status(found) == {"torch": "ok", "numpy": "problem", "no-such-package": "problem", "rich": "problem"}
-    assert found[2].advice == "python -m pip install 'no-such-package>=1'"
-    assert "boom" in found[3].detail
+    reported = findings.package_findings(wanted, {"rich": Probe({}, "ImportError: boom")})
+    assert status(reported) == {"torch": "ok", "numpy": "problem", "no-such-package": "problem", "rich": "problem"}
+    assert reported[2].advice == "python -m pip install 'no-such-package>=1'"
+    assert "boom" in reported[3].detail
 
 
 def test_extras_are_whole_or_absent() -> None:
@@ -109,10 +109,10 @@ def test_extras_are_whole_or_absent() -> None:
 
 
 def test_own_requirements_are_read_with_their_bounds() -> None:
-    found = findings.own_requirements()
-    assert "torch>=2.4" in [f"{each.name}{each.specifier}" for each in found[""]]
-    assert "pytest" in [each.name for each in found["dev"]]
-    assert "pytest" not in [each.name for each in found[""]]
+    requirements = findings.own_requirements()
+    assert "torch>=2.4" in [f"{requirement.name}{requirement.specifier}" for requirement in requirements[""]]
+    assert "pytest" in [requirement.name for requirement in requirements["dev"]]
+    assert "pytest" not in [requirement.name for requirement in requirements[""]]
 
 
 def test_gsplat_needs_a_gpu_for_its_cuda_part() -> None:
@@ -147,8 +147,8 @@ def test_a_probe_survives_whatever_an_import_does(module: str, error: str) -> No
 
 def test_an_extension_that_is_not_installed_is_absent_and_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(findings, "run_probe", None)
-    found = findings.extension_finding("lapgs_not_there._C", "rasterizer of a test")
-    assert found == Finding("lapgs_not_there._C", "absent", "not installed (rasterizer of a test)")
+    finding = findings.extension_finding("lapgs_not_there._C", "rasterizer of a test")
+    assert finding == Finding("lapgs_not_there._C", "absent", "not installed (rasterizer of a test)")
 
 
 GRAPHDECO = ("train.py", "gaussian_renderer/__init__.py", "scene/gaussian_model.py")
@@ -168,9 +168,9 @@ def test_checkouts_are_recognised(files: tuple[str, ...], name: str | None, tmp_
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
-    found = current_folder(tmp_path, has_gpu=False)
-    assert found.detail.startswith(f"a checkout of {name}" if name else "not a known 3DGS checkout")
-    assert ("lapgs run" in found.detail) == (name not in (None, "gsplat"))
+    finding = current_folder(tmp_path, has_gpu=False)
+    assert finding.detail.startswith(f"a checkout of {name}" if name else "not a known 3DGS checkout")
+    assert ("lapgs run" in finding.detail) == (name not in (None, "gsplat"))
 
 
 def test_what_triton_needs_to_start_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -222,7 +222,7 @@ def test_terms_of_the_loss_add_up_with_their_gradients() -> None:
 def test_a_hook_sees_no_more_than_the_context() -> None:
     images = {"target", "accumulated", "coarse_target", "weight"}
     assert set(vars(context())) == {"stage", "iteration", "view", "field"} | images
-    assert [each.name for each in fields(FieldInTraining)] == ["gaussians", "camera", "rasterizer"]
+    assert [field.name for field in fields(FieldInTraining)] == ["gaussians", "camera", "rasterizer"]
     with pytest.raises(FrozenInstanceError):
         context().iteration = 1  # type: ignore[misc]  # that it is refused is what is tested
 

@@ -122,10 +122,10 @@ def _model(tracks: bool = True) -> pycolmap.Reconstruction:
     return model
 
 
-def _scene(path: Path, place: str = "sparse/0", photos: str = "images", tracks: bool = True) -> Path:
+def _scene(path: Path, model_folder: str = "sparse/0", photos: str = "images", tracks: bool = True) -> Path:
     _photos(path / photos)
-    (path / place).mkdir(parents=True)
-    _model(tracks).write_binary(path / place)
+    (path / model_folder).mkdir(parents=True)
+    _model(tracks).write_binary(path / model_folder)
     return path
 
 
@@ -196,28 +196,28 @@ def test_models_are_found_where_programs_leave_them(tmp_path: Path, place: str, 
 
 
 def test_a_model_elsewhere_in_text_and_smaller_copies(tmp_path: Path) -> None:
-    photos, place = tmp_path / "photos", tmp_path / "exported"
+    photos, exported = tmp_path / "photos", tmp_path / "exported"
     _photos(photos)
     for name in PHOTOS:
         half = cv2.resize(cv2.imread(str(photos / name)), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(photos / name), half, [cv2.IMWRITE_JPEG_QUALITY, 98])
-    place.mkdir()
-    _model().write_text(place)
-    assert len(_run(photos, tmp_path / "out", model=place).registered) == 5
+    exported.mkdir()
+    _model().write_text(exported)
+    assert len(_run(photos, tmp_path / "out", model=exported).registered) == 5
     model = _check_images(tmp_path / "out", 0.02)  # seen 0.0092; half a pixel is 0.034
     focal = {image.name: model.cameras[image.camera_id].params[0] for image in model.images.values()}
     assert focal["c.png"] == pytest.approx(70)
-    _run(photos, tmp_path / "smaller", model=place, max_size=64)
+    _run(photos, tmp_path / "smaller", model=exported, max_size=64)
     assert load_scene(tmp_path / "smaller", progress=False).train[0].camera.width < 64 + 16
 
 
-def _without(model: pycolmap.Reconstruction, names: set[str], place: Path) -> None:
+def _without(model: pycolmap.Reconstruction, names: set[str], folder: Path) -> None:
     """Write the model without the images of these names."""
     for image in [image for image in model.images.values() if image.name in names]:
         model.deregister_frame(image.frame_id)
     model.tear_down()
-    place.mkdir(parents=True, exist_ok=True)
-    model.write_binary(place)
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
 
 
 def test_the_largest_of_several_models_is_taken(tmp_path: Path) -> None:
@@ -245,14 +245,14 @@ def test_a_larger_model_that_convert_py_leaves_distorted(tmp_path: Path, caplog:
 
 
 def test_observations_that_do_not_fit_are_left_out(tmp_path: Path) -> None:
-    scene, place = _scene(tmp_path / "scene"), tmp_path / "edited"
-    place.mkdir()
-    _model().write_text(place)
-    points = place / "points3D.txt"
+    scene, edited = _scene(tmp_path / "scene"), tmp_path / "edited"
+    edited.mkdir()
+    _model().write_text(edited)
+    points = edited / "points3D.txt"
     *comments, first, second, third = points.read_text().splitlines()[: 3 + 3]
     taken = "31 0 0 5 1 2 3 0 1 1 2 1"  # features of the second point
     points.write_text("\n".join([*comments, f"{first} 99 0 1 77 1 -1", second, f"{third} 1", taken]))
-    result = _run(scene, tmp_path / "out", model=place)
+    result = _run(scene, tmp_path / "out", model=edited)
     assert result.points == 4
     model = _check_images(tmp_path / "out", 0.01)
     assert sorted(len(point.track.elements) for point in model.points3D.values()) == [0, 0, 5, 5]
@@ -319,9 +319,9 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
     model.write_binary(scene / "sparse" / "0")
     assert _run(scene, tmp_path / "out").left_out == (names[0],)
     written = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
-    found = {image.name: image.cam_from_world().matrix() for image in written.images.values()}
-    assert sorted(found) == sorted(names[1:])
-    for name, matrix in found.items():
+    result = {image.name: image.cam_from_world().matrix() for image in written.images.values()}
+    assert sorted(result) == sorted(names[1:])
+    for name, matrix in result.items():
         np.testing.assert_allclose(matrix, poses[name], atol=1e-12)
 
 

@@ -174,6 +174,10 @@ def revert(target: Target, *sets: str) -> dict[str, bytes]:
     return snapshot(target.folder)
 
 
+def states(target: Target) -> dict[str, State]:
+    return {edits.set: edits.state for edits in status(target)}
+
+
 def bare(data: bytes) -> str:
     """Return a file without comments, spliced lines and white space."""
     text = re.sub(r"\\\r?\n", "", data.decode("latin-1"))
@@ -186,8 +190,8 @@ def expected(file: str, sets: set[str]) -> str:
     tokens = list(program.tokens)
     edits = [edit for edit in EDITS.values() if edit.file == file and edit.set in sets]
     for edit in sorted(edits, key=lambda edit: program.anchors[edit.name].start, reverse=True):
-        place = program.anchors[edit.name]
-        tokens[place.start : place.start if edit.replace is None else place.stop] = [edit.put]
+        span = program.anchors[edit.name]
+        tokens[span.start : span.start if edit.replace is None else span.stop] = [edit.put]
     return bare("\n".join(tokens).encode())
 
 
@@ -227,23 +231,24 @@ def test_sets_come_and_go_independently(root: Path, tree: dict[str, bytes]) -> N
 @given(data=st.data())
 def test_a_tree_without_any_one_anchor_is_refused_and_untouched(root: Path, data: st.DataObject) -> None:
     file, name = data.draw(st.sampled_from([(file, name) for file, p in PARSED.items() for name in p.anchors]))
-    tokens, place = PARSED[file].tokens, PARSED[file].anchors[name]
-    lost = data.draw(st.sampled_from(place))
+    tokens, span = PARSED[file].tokens, PARSED[file].anchors[name]
+    lost = data.draw(st.sampled_from(span))
     broken = data.draw(trees({**PARSED, file: Program(tokens[:lost] + tokens[lost + 1 :], {})}))
     target = write_tree(root, broken)
     with pytest.raises(PatchError, match=rf"{file}:\d+: expected `.*` once .*but found it nowhere"):
         plan_apply(target, [ALL_SETS])
     assert snapshot(root) == broken
-    impossible = {found.set for found in status(target) if found.state is State.IMPOSSIBLE}
-    assert impossible == {EDITS[name].set if name in EDITS else CHECK.set}
+    assert {name for name, state in states(target).items() if state is State.IMPOSSIBLE} == {
+        EDITS[name].set if name in EDITS else CHECK.set
+    }
 
 
 @pytest.mark.parametrize("name", EDITS)
 def test_an_anchor_that_stands_twice_is_refused(root: Path, name: str) -> None:
     file = EDITS[name].file
     program = PARSED[file]
-    place = program.anchors[name]
-    tokens = [*program.tokens[: place.stop], ";", *program.tokens[place.start :]]
+    span = program.anchors[name]
+    tokens = [*program.tokens[: span.stop], ";", *program.tokens[span.start :]]
     target = write_tree(root, {other: lay_out(p.tokens, plain()) for other, p in PARSED.items()})
     (root / file).write_bytes(lay_out(tokens, plain()))
     with pytest.raises(PatchError, match="but found it twice"):
@@ -261,36 +266,32 @@ def target(tmp_path: Path, tree: dict[str, bytes]) -> Target:
 
 
 def test_a_message_names_the_place_what_was_expected_and_that_nothing_happened(target: Target) -> None:
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     path.write_bytes(path.read_bytes().replace(b"0.5f\n;\nflags", b"0.25f\n;\nflags"))
     line = path.read_bytes()[: path.read_bytes().index(b"shade\n(\nint\ni")].count(b"\n") + 1
-    with pytest.raises(PatchError) as caught:
-        plan_apply(target, ["signed"])
-    message = str(caught.value)
-    assert f"kernels/shade.cu:{line}: expected `result += 0.5f;` once in shade but found it nowhere" in message
-    assert "signed/raw" in message
-    assert message.endswith(
-        "; nothing was changed; a rasterizer that differs needs a recipe of its own, see `lapgs help patches`"
+    facts = (
+        rf"shade\.cu:{line}: .*`result \+= 0\.5f;` once in shade .*signed/raw.*nothing was changed.*lapgs help patches"
     )
-    assert "\n" not in message
+    with pytest.raises(PatchError, match=facts) as caught:
+        plan_apply(target, ["signed"])
+    assert "\n" not in str(caught.value)
 
 
 def test_a_function_defined_twice_or_never_is_refused(target: Target) -> None:
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     source = path.read_bytes()
-    path.write_bytes(source + b"float shade(int a) { return a; }")
-    with pytest.raises(PatchError, match="expected one definition of shade, found 2"):
-        plan_apply(target, ["signed"])
-    path.write_bytes(source.replace(b"shade\n(\nint\ni", b"tone\n(\nint\ni"))
-    with pytest.raises(PatchError, match="expected one definition of shade, found 0"):
-        plan_apply(target, ["signed"])
+    never = source.replace(b"shade\n(\nint\ni", b"tone\n(\nint\ni")
+    for changed, count in ((source + b"float shade(int a) { return a; }", 2), (never, 0)):
+        path.write_bytes(changed)
+        with pytest.raises(PatchError, match=f"one definition of shade, found {count}"):
+            plan_apply(target, ["signed"])
     path.unlink()
     with pytest.raises(PatchError, match=r"kernels/shade\.cu: expected this file"):
         plan_apply(target, ["signed"])
 
 
 def test_what_looks_like_code_in_strings_comments_and_macros_is_not_code(target: Target) -> None:
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     decoys = (
         b'const char* a = "if (deg > 0) { \\" // "; const char* b = R"x(if (deg > 0) )" })x";\n'
         b"char c = '\"', d = '{';\n"
@@ -299,26 +300,26 @@ def test_what_looks_like_code_in_strings_comments_and_macros_is_not_code(target:
     )
     path.write_bytes(path.read_bytes().replace(b"flags\n[", decoys + b"flags\n["))
     before = path.read_bytes()
-    after = apply(target, ALL_SETS)["kernels/shade.cu"]
+    after = apply(target, ALL_SETS)[SHADE]
     assert decoys in after
     assert after.count(b">>> lapgs") == 4
-    assert revert(target, ALL_SETS)["kernels/shade.cu"] == before
+    assert revert(target, ALL_SETS)[SHADE] == before
 
 
 def test_a_replaced_text_with_comments_and_backslashes_comes_back(target: Target) -> None:
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     odd = b"space /* a */ :: \\\r\n top(result, // *\\/ \\* \n /*\\*/ 0.0f)"
     path.write_bytes(path.read_bytes().replace(b"space\n::\ntop\n(\nresult\n,\n0.0f\n)", odd))
     before = path.read_bytes()
     assert odd in before
-    assert b"most(result)" in apply(target, ALL_SETS)["kernels/shade.cu"]
-    assert revert(target, ALL_SETS)["kernels/shade.cu"] == before
+    assert b"most(result)" in apply(target, ALL_SETS)[SHADE]
+    assert revert(target, ALL_SETS)[SHADE] == before
 
 
 def test_blocks_have_the_indentation_and_line_ending_of_their_place(target: Target) -> None:
-    path = target.folder / "kernels/host.h"
+    path = target.folder / HOST
     path.write_bytes(b"#pragma once\r\n\t  namespace kernels { }\r\nint last;\n")
-    text = apply(target, "build")["kernels/host.h"]
+    text = apply(target, "build")[HOST]
     lines = text.split(b"\r\n")
     assert re.fullmatch(rb"\t  // >>> lapgs build/guard [0-9a-f]{8}", lines[1])
     assert lines[2:7] == [b"\t  /* why */", b"\t  int b;", b"\t  #if 1", b"\t  #endif", b"\t  // <<< lapgs"]
@@ -326,28 +327,25 @@ def test_blocks_have_the_indentation_and_line_ending_of_their_place(target: Targ
 
 def test_changes_of_the_user_outside_the_blocks_stay(target: Target, tree: dict[str, bytes]) -> None:
     apply(target, ALL_SETS)
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     path.write_bytes(b"// mine\n" + path.read_bytes().replace(b"darker", b"dimmer"))
-    assert revert(target, ALL_SETS) == {
-        **tree,
-        "kernels/shade.cu": b"// mine\n" + tree["kernels/shade.cu"].replace(b"darker", b"dimmer"),
-    }
+    assert revert(target, ALL_SETS) == {**tree, SHADE: b"// mine\n" + tree[SHADE].replace(b"darker", b"dimmer")}
 
 
 def test_a_block_changed_by_hand_is_refused_both_ways(target: Target) -> None:
     apply(target, ALL_SETS)
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     path.write_bytes(path.read_bytes().replace(b"deg &= 7;", b"deg &= 15;"))
     line = path.read_bytes()[: path.read_bytes().index(b"// >>> lapgs signed/strip")].count(b"\n") + 1
     for plan in (plan_apply, plan_revert):
         with pytest.raises(PatchError, match=rf"shade\.cu:{line}: the block signed/strip is not as lapgs wrote it"):
             plan(target, [ALL_SETS])
-    assert {found.set: found.state for found in status(target)}["signed"] is State.IMPOSSIBLE
+    assert states(target)["signed"] is State.IMPOSSIBLE
 
 
 def test_a_block_that_was_only_reformatted_can_be_taken_out(target: Target) -> None:
     apply(target, "signed")
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     path.write_bytes(path.read_bytes().replace(b"int flag = deg;\ndeg &= 7;", b"  int flag  = deg;\n    deg &= 7;"))
     assert b">>> lapgs" not in b"".join(revert(target, "signed").values())
 
@@ -355,7 +353,7 @@ def test_a_block_that_was_only_reformatted_can_be_taken_out(target: Target) -> N
 @pytest.mark.parametrize("marker", [b"// <<< lapgs\n", b"/*<<< lapgs*/"])
 def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
     apply(target, ALL_SETS)
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     head, tail = path.read_bytes().rsplit(marker, 1)
     path.write_bytes(head + tail)
     for plan in (plan_apply, plan_revert):
@@ -364,29 +362,26 @@ def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
 
 
 def test_states(target: Target) -> None:
-    def states() -> dict[str, State]:
-        return {found.set: found.state for found in status(target)}
-
-    assert states() == {"signed": State.NOT_APPLIED, "build": State.NOT_APPLIED}
+    assert states(target) == {"signed": State.NOT_APPLIED, "build": State.NOT_APPLIED}
     apply(target, "build")
-    assert states() == {"signed": State.NOT_APPLIED, "build": State.APPLIED}
-    before = (target.folder / "kernels/host.h").read_bytes()
+    assert states(target) == {"signed": State.NOT_APPLIED, "build": State.APPLIED}
+    before = (target.folder / HOST).read_bytes()
     revert(target, "build")
-    (target.folder / "kernels/host.h").write_bytes(before)
-    assert states() == {"signed": State.NOT_APPLIED, "build": State.INCOMPLETE}
+    (target.folder / HOST).write_bytes(before)
+    assert states(target) == {"signed": State.NOT_APPLIED, "build": State.INCOMPLETE}
     apply(target, "signed")
-    assert states() == {"signed": State.APPLIED, "build": State.APPLIED}
+    assert states(target) == {"signed": State.APPLIED, "build": State.APPLIED}
 
 
 def test_a_set_that_is_opt_in_goes_in_by_name_only_and_out_with_all(target: Target, tree: dict[str, bytes]) -> None:
     chosen = replace(target, recipe=replace(target.recipe, opt_in=("build",)))
     apply(chosen, ALL_SETS)
-    assert {found.set: found.state for found in status(chosen)} == {
+    assert states(chosen) == {
         "signed": State.APPLIED,
         "build": State.NOT_APPLIED,
     }
     apply(chosen, "build")
-    assert {found.state for found in status(chosen)} == {State.APPLIED}
+    assert set(states(chosen).values()) == {State.APPLIED}
     after = snapshot(target.folder)
     apply(chosen, ALL_SETS)
     assert snapshot(target.folder) == after
@@ -396,7 +391,7 @@ def test_a_set_that_is_opt_in_goes_in_by_name_only_and_out_with_all(target: Targ
 def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, bytes]) -> None:
     older = replace(RECIPE, edit=(replace(EDITS["raw"], name="old", before="return 2;"),))
     write_all(plan_apply(Target(older, target.folder), ["signed"]))
-    assert {found.set: found.state for found in status(target)}["signed"] is State.INCOMPLETE
+    assert states(target)["signed"] is State.INCOMPLETE
     renewed = apply(target, "signed")
     assert renewed == apply(write_tree(target.folder, tree), "signed")
     newer = replace(RECIPE, edit=(EDITS["guard"],))
@@ -432,14 +427,14 @@ def test_a_write_that_fails_leaves_every_file_as_it_was(
 
 def test_a_file_changed_meanwhile_is_not_overwritten(target: Target, tree: dict[str, bytes]) -> None:
     changes = plan_apply(target, [ALL_SETS])
-    (target.folder / "kernels/host.h").write_bytes(b"new")
+    (target.folder / HOST).write_bytes(b"new")
     with pytest.raises(PatchError, match="changed by another program"):
         write_all(changes)
-    assert snapshot(target.folder) == {**tree, "kernels/host.h": b"new"}
+    assert snapshot(target.folder) == {**tree, HOST: b"new"}
 
 
 def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
-    path = target.folder / "kernels/shade.cu"
+    path = target.folder / SHADE
     moved = tmp_path / "elsewhere.cu"
     path.rename(moved)
     moved.chmod(0o755)
@@ -453,7 +448,7 @@ def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
 def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> None:
     changes = plan_apply(target, [ALL_SETS])
     assert read_only(changes) == []
-    folder, file = target.folder / "kernels", target.folder / "kernels/host.h"
+    folder, file = target.folder / "kernels", target.folder / HOST
     file.chmod(0o444)
     folder.chmod(0o555)
     try:
@@ -563,11 +558,11 @@ def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: 
     copies = tmp_path / "copies"
     copies.mkdir()
     subprocess.run([sys.executable, "-c", KILLED_AT, str(copies), str(checkout)], check=True)
-    found = sorted(copies.iterdir())
+    checkouts = sorted(copies.iterdir())
     # Opening, both sides of the sync, the mode and the renaming of four files, and one run to the end, both ways.
-    assert len(found) >= 2 * (4 * 5 + 1)
+    assert len(checkouts) >= 2 * (4 * 5 + 1)
     left = 0
-    for number, copy in enumerate(found):
+    for number, copy in enumerate(checkouts):
         tree = snapshot(copy)
         temporaries = tree.keys() - before.keys()
         assert all(re.fullmatch(r"\..*\.[a-z0-9_]{8}\.lapgs", Path(name).name) for name in temporaries)
@@ -579,7 +574,7 @@ def test_killed_at_any_write_the_next_command_leaves_nothing_behind(rasterizer: 
         assert snapshot(copy) == after
         lapgs_patch("revert", copy)
         assert snapshot(copy) == before
-    assert left > len(found) // 2, "most of these deaths leave something"
+    assert left > len(checkouts) // 2, "most of these deaths leave something"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="folders have no locks there")
@@ -710,16 +705,11 @@ def rasterizer(tmp_path: Path) -> Path:
 
 def test_every_recipe_has_a_way_to_reinstall_and_edits_with_different_names() -> None:
     recipes = load_recipes()
-    assert {recipe.name for recipe in recipes} >= {
-        "fastgs",
-        "taming",
-        "taming-rasterizer",
-        "graphdeco",
-        "graphdeco-accel",
-    }
+    names = {recipe.name for recipe in recipes}
+    assert names >= {"fastgs", "taming", "taming-rasterizer", "graphdeco", "graphdeco-accel"}
     for recipe in recipes:
-        names = [(edit.set, edit.name) for edit in recipe.edit]
-        assert len(names) == len(set(names))
+        labels = [edit.label for edit in recipe.edit]
+        assert len(labels) == len(set(labels))
         assert "{folder}" in recipe.reinstall
         assert "build-cuda13" in recipe.sets
 
@@ -823,8 +813,7 @@ def test_a_header_that_the_source_has_is_not_included_again(rasterizer: Path, ha
     path.write_text(has + path.read_text())
     before = snapshot(rasterizer)
     (target,) = find_targets(rasterizer)
-    states = {found.set: found.state for found in status(target)}
-    assert states["build-cuda13"] is (State.NOT_APPLIED if needed else State.NOT_NEEDED)
+    assert states(target)["build-cuda13"] is (State.NOT_APPLIED if needed else State.NOT_NEEDED)
     after = apply(target, ALL_SETS)
     name = "cuda_rasterizer/rasterizer_impl.h"
     assert after[name].count(b">>> lapgs") == needed
@@ -835,7 +824,7 @@ def test_a_header_that_the_source_has_is_not_included_again(rasterizer: Path, ha
 
 @pytest.mark.parametrize("recipe", ["simple-knn", "taming-rasterizer", "fastgs", "taming"])
 def test_float_limits_are_included_once(tmp_path: Path, recipe: str) -> None:
-    (edit,) = (each for each in {r.name: r for r in load_recipes()}[recipe].edit if each.name == "cfloat")
+    (edit,) = (one for one in {r.name: r for r in load_recipes()}[recipe].edit if one.name == "cfloat")
     only = Recipe("only", "only", (Anchor(edit.file),), edit=(edit,))
     path = tmp_path / edit.file
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -858,15 +847,15 @@ def test_a_header_included_twice_by_an_earlier_version_is_taken_out(rasterizer: 
     older = replace(target, recipe=replace(target.recipe, edit=edits))
     write_all(plan_apply(older, ["build-cuda13"]))
     assert path.read_text().count("#include <cstdint>") == 2
-    assert {found.set: found.state for found in status(target)}["build-cuda13"] is State.INCOMPLETE
+    assert states(target)["build-cuda13"] is State.INCOMPLETE
     assert apply(target, "build-cuda13") == before
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2, 3])  # as of a checkout in a checkout, which doctor finds, too
 def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, depth: int) -> None:
     checkout = [rasterizer, *rasterizer.parents][depth]
-    (found,) = find_targets(checkout)
-    assert (found.recipe.name, found.folder) == ("graphdeco", rasterizer)
+    (target,) = find_targets(checkout)
+    assert (target.recipe.name, target.folder) == ("graphdeco", rasterizer)
 
 
 def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
@@ -876,43 +865,31 @@ def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
         find_targets(tmp_path / "missing")
 
 
+HEAD = 'name = "new"\ntitle = "New"\npresent = []\n'
+EDIT = HEAD + '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\n'
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("name = [", "is not TOML"),
         ('name = "new"\ntitle = "New"', "it lacks present"),
-        ('name = "old"\ntitle = "New"\npresent = []', "its name is 'old', expected that of the file"),
-        ('name = "new"\ntitle = "New"\npresent = []\nextends = "old"', "extends 'old', expected one of"),
-        ('name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"', "lapgs help patches"),
-        (
-            'name = "new"\ntitle = "New"\npresent = []\n'
-            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nafter = "e"',
-            "it has an unknown key edit[0].after",
-        ),
-        (
-            'name = "new"\ntitle = "New"\npresent = []\n[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"',
-            "either `before` or `replace`",
-        ),
-        ('name = "new"\ntitle = "New"\npresent = []\nextends = "new"', "expected one without a circle"),
-        ('name = "new"\ntitle = 5\npresent = []', "title is 5, expected a valid string"),
-        ('name = "new"\ntitle = "New"\npresent = [3]', "present[0] is 3, expected"),
-        (
-            'name = "new"\ntitle = "New"\npresent = []\n'
-            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = "d"\nbefore = "e"\nunless = ["include"]',
-            "expected directives that start with #",
-        ),
-        (
-            'name = "new"\ntitle = "New"\npresent = []\n'
-            '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\nfind = " "\nbefore = "e"',
-            "has nothing to find",
-        ),
+        (HEAD.replace("new", "old"), "its name is 'old'"),
+        (HEAD + 'extends = "old"', "extends 'old', expected one of"),
+        (HEAD + '[[edit]]\nset = "a"', "lapgs help patches"),
+        (EDIT + 'find = "d"\nafter = "e"', "unknown key edit[0].after"),
+        (EDIT + 'find = "d"', "either `before` or `replace`"),
+        (HEAD + 'extends = "new"', "without a circle"),
+        (HEAD.replace('"New"', "5"), "title is 5"),
+        (HEAD.replace("[]", "[3]"), "present[0] is 3"),
+        (EDIT + 'find = "d"\nbefore = "e"\nunless = ["include"]', "directives that start with #"),
+        (EDIT + 'find = " "\nbefore = "e"', "nothing to find"),
     ],
 )
 def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "new.toml").write_text(text)
-    with pytest.raises(PatchError, match=r"new\.toml") as caught:
+    with pytest.raises(PatchError, match=rf"new\.toml.*{re.escape(message)}"):
         load_recipes(tmp_path)
-    assert message in str(caught.value)
 
 
 def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> None:
@@ -922,9 +899,9 @@ def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> 
     child = head.format("child", "y") + 'extends = "base"\n' + edit.format("one", 3) + edit.format("three", 4)
     (tmp_path / "base.toml").write_text(base)
     (tmp_path / "child.toml").write_text(child)
-    found = load_recipes(tmp_path)[1]
-    assert [(e.name, e.put) for e in found.edit] == [("one", "3"), ("two", "2"), ("three", "4")]
-    assert (found.present, found.reinstall) == ((Anchor("y"),), "make {folder}")
+    recipe = load_recipes(tmp_path)[1]
+    assert [(e.name, e.put) for e in recipe.edit] == [("one", "3"), ("two", "2"), ("three", "4")]
+    assert (recipe.present, recipe.reinstall) == ((Anchor("y"),), "make {folder}")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -1031,7 +1008,9 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             assert {found.state for found in status(target)} <= {State.APPLIED, State.NOT_NEEDED}
             blocks = sum(data.count(b">>> lapgs") for data in after.values())
             spared = [
-                edit for edit in target.recipe.edit if any(each.encode() in before[edit.file] for each in edit.unless)
+                edit
+                for edit in target.recipe.edit
+                if any(directive.encode() in before[edit.file] for directive in edit.unless)
             ]
             assert blocks == len(target.recipe.edit) - len(spared)
             assert apply(target, *target.recipe.sets) == after

@@ -141,10 +141,10 @@ def test_transparent_pixels_are_masks(tmp_path: Path, monkeypatch: pytest.Monkey
         pixels = WALL[:64, 4 * index : 4 * index + 96]
         cv2.imwrite(str(photos / f"{index}.png"), pixels if index == 2 else np.concatenate([pixels, alpha], axis=2))
     _stopping_before_colmap(photos, tmp_path / "scene", monkeypatch)
-    made = tmp_path / "scene" / ".prepare" / "masks"
+    masks = tmp_path / "scene" / ".prepare" / "masks"
     for index in range(3):  # COLMAP leaves out photos without a mask
         expected = np.full_like(alpha, 255) if index == 2 else alpha
-        assert np.array_equal(cv2.imread(str(made / f"{index}.png.png"))[..., :1], expected)
+        assert np.array_equal(cv2.imread(str(masks / f"{index}.png.png"))[..., :1], expected)
 
 
 def _stopping_before_colmap(photos: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
@@ -248,9 +248,9 @@ def test_a_video_gives_its_frames_to_colmap(
     with caplog.at_level(logging.INFO):
         _stopping_before_colmap(clip, tmp_path / "scene", monkeypatch, frames=6)
     assert "walk.mp4: 6 sharp frames, evenly spread" in caplog.text
-    made = tmp_path / "scene" / ".prepare" / "photos"
-    assert [file.name for file in sorted(made.iterdir())] == [f"frame_{number:06d}.jpg" for number in range(2, 24, 4)]
-    job = Job(made.parent, find_photos(clip), PrepareSettings(), False)
+    copies = tmp_path / "scene" / ".prepare" / "photos"
+    assert [file.name for file in sorted(copies.iterdir())] == [f"frame_{number:06d}.jpg" for number in range(2, 24, 4)]
+    job = Job(copies.parent, find_photos(clip), PrepareSettings(), False)
     assert (chosen_matcher(job), len(job.names)) == ("sequential", 6)
 
 
@@ -482,5 +482,5 @@ def test_cameras_that_rest_on_few_points_are_told() -> None:
 
 def test_many_photos_are_matched_by_retrieval(tmp_path: Path) -> None:
     for count, matcher in ((500, "exhaustive"), (501, "retrieval")):
-        found = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(count)})
-        assert chosen_matcher(Job(tmp_path, found, PrepareSettings(), False)) == matcher
+        listed = photos_module.Photos(tmp_path, {f"{index}.jpg": tmp_path for index in range(count)})
+        assert chosen_matcher(Job(tmp_path, listed, PrepareSettings(), False)) == matcher

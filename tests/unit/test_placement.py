@@ -26,20 +26,20 @@ PHOTOS, SIMPLE = 8, "SIMPLE_RADIAL"
 
 def model(*tracks: tuple[int, Sequence[int]], photos: int = PHOTOS, error: float = 0.0) -> pycolmap.Reconstruction:
     """Make a model of photos 1, 2, ..., with numbers of points by the photos that see them, and their error."""
-    made = pycolmap.Reconstruction()
+    result = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 50.0, 64, 48)
-    made.add_camera_with_trivial_rig(camera)
+    result.add_camera_with_trivial_rig(camera)
     count = sum(points for points, _ in tracks)
     for number in range(1, photos + 1):
         image = pycolmap.Image(f"{number}.jpg", keypoints=np.ones((count, 2)), camera_id=1, image_id=number)
-        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        result.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     index = 0
     for points, seen_by in tracks:
         for _ in range(points):
             track = pycolmap.Track([pycolmap.TrackElement(number, index) for number in seen_by])
-            made.points3D[made.add_point3D(np.ones(3), track, np.zeros(3, np.uint8))].error = error
+            result.points3D[result.add_point3D(np.ones(3), track, np.zeros(3, np.uint8))].error = error
             index += 1
-    return made
+    return result
 
 
 def placed(reconstruction: pycolmap.Reconstruction) -> list[int]:
@@ -47,14 +47,14 @@ def placed(reconstruction: pycolmap.Reconstruction) -> list[int]:
 
 
 def test_photos_that_points_do_not_link_are_removed() -> None:
-    made = model((15, (1, 2, 3)), (15, (3, 4)), (200, (5, 6)), (14, (4, 5)), (3, (7, 1)))
-    remove_unlinked(made)
-    assert placed(made) == [1, 2, 3, 4]
-    assert made.num_points3D() == 30
+    linked = model((15, (1, 2, 3)), (15, (3, 4)), (200, (5, 6)), (14, (4, 5)), (3, (7, 1)))
+    remove_unlinked(linked)
+    assert placed(linked) == [1, 2, 3, 4]
+    assert linked.num_points3D() == 30
     for photos in (0, 2):
-        made = model(photos=photos)
-        remove_unlinked(made)
-        assert len(placed(made)) == min(photos, 1)
+        linked = model(photos=photos)
+        remove_unlinked(linked)
+        assert len(placed(linked)) == min(photos, 1)
 
 
 @pytest.mark.parametrize(
@@ -88,29 +88,31 @@ def test_the_attempt_that_places_most_photos_is_kept(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     asked: list[tuple[str | None, str | None, Path | None]] = []
-    made: list[pycolmap.Reconstruction] = []
+    models: list[pycolmap.Reconstruction] = []
 
     def mapped(_: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
         asked.append((attempt.lens, attempt.mapper, attempt.database))
         photos = placed_by[len(asked) - 1]
         # The global mapper gives every photo a place; only some are linked.
-        found = model((20, range(1, photos + 1)), photos=PHOTOS if attempt.mapper == GLOBAL else photos)
+        photographs = model((20, range(1, photos + 1)), photos=PHOTOS if attempt.mapper == GLOBAL else photos)
         if attempt.lens is None:
-            found.cameras[1].model = pycolmap.CameraModelId.PINHOLE
-            found.cameras[1].params = [focal, 50.0, 32.0, 24.0]
-        made.append(found)
-        return [found]
+            photographs.cameras[1].model = pycolmap.CameraModelId.PINHOLE
+            photographs.cameras[1].params = [focal, 50.0, 32.0, 24.0]
+        models.append(photographs)
+        return [photographs]
 
     monkeypatch.setattr(placement, "map_photos", mapped)
     monkeypatch.setattr(placement, "match_more", lambda job: job.work / "more.db")
-    found = Photos(Path("photos"), {f"{number}.jpg": Path() for number in range(1, PHOTOS + 1)})
+    photographs = Photos(Path("photos"), {f"{number}.jpg": Path() for number in range(1, PHOTOS + 1)})
     with caplog.at_level(logging.INFO):
-        (best,) = placement.place_cameras(Job(Path("work"), found, PrepareSettings(camera_model=lens), progress=False))
+        (best,) = placement.place_cameras(
+            Job(Path("work"), photographs, PrepareSettings(camera_model=lens), progress=False)
+        )
     more = Path("work", "more.db")
     expected = [(None, None, None), (SIMPLE, None, None), (SIMPLE, INCREMENTAL, more), (SIMPLE, GLOBAL, more)]
     assert asked == expected[:attempts]
     assert best.num_reg_images() == kept
-    assert best is next(each for each in reversed(made) if each.num_reg_images() == kept)
+    assert best is next(one for one in reversed(models) if one.num_reg_images() == kept)
     assert message in caplog.text
     assert bool(message) == bool(caplog.text)
 
@@ -147,9 +149,9 @@ def test_the_error_of_an_attempt_counts_as_well_as_its_number_of_photos(
 ) -> None:
     attempts = []
     for photos, error in (first, again):
-        made = model((20, range(1, photos + 1)), error=error)
-        remove_unlinked(made)  # photos without points
-        attempts.append(made)
+        placed = model((20, range(1, photos + 1)), error=error)
+        remove_unlinked(placed)  # photos without points
+        attempts.append(placed)
     (kept,) = two_attempts(*attempts, tmp_path, monkeypatch)
     assert (kept is attempts[1]) == simple
     if first[0] == PHOTOS and not simple:
@@ -260,9 +262,9 @@ def test_more_matches_start_from_the_whole_database_after_an_interruption(
         shutil.copy(tmp_path / f"killed.db{suffix}", tmp_path / f"guided.partial{suffix}")
     write(tmp_path / "database.db", [(1, 14), (2, 15)])
     monkeypatch.setattr(colmap, "_run_step", lambda *_: write(tmp_path / "guided.partial", [(2, 30)]))
-    found = match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False))
-    assert found is not None
-    with closing(sqlite3.connect(found)) as database:
+    guided = match_more(Job(tmp_path, Photos(tmp_path, {}), PrepareSettings(), progress=False))
+    assert guided is not None
+    with closing(sqlite3.connect(guided)) as database:
         assert list(database.execute("SELECT * FROM two_view_geometries")) == [(1, 14), (2, 30)]
     for reader in readers:
         reader.close()

@@ -134,8 +134,8 @@ def _centre_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     images = sorted(model.images.values(), key=lambda image: image.name)
     exact = {f"{index:02d}": camera.position.numpy() for index, camera in enumerate(_arc(SIZE, FOCAL))}
     target = np.array([exact[Path(image.name).stem] for image in images])
-    found = np.array([image.projection_center() for image in images])
-    return np.linalg.norm(_align(found, target) - target, axis=1) / 4.6
+    centers = np.array([image.projection_center() for image in images])
+    return np.linalg.norm(_align(centers, target) - target, axis=1) / 4.6
 
 
 def test_cameras_are_recovered_up_to_a_similarity(prepared: tuple[Path, PrepareResult]) -> None:
@@ -180,8 +180,8 @@ def _error_after_homography(image: NDArray[np.float64], exact: NDArray[np.float3
     start = np.eye(3, dtype=np.float32)
     start[:2, 2] = (np.array(exact.shape[1::-1]) - size) / 2
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-6)
-    _, found = cv2.findTransformECC(target, blurred, start, cv2.MOTION_HOMOGRAPHY, stop)
-    warped = cv2.warpPerspective(blurred, found, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    _, warp = cv2.findTransformECC(target, blurred, start, cv2.MOTION_HOMOGRAPHY, stop)
+    warped = cv2.warpPerspective(blurred, warp, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return float(np.sqrt(np.mean((warped - target)[8:-8, 8:-8] ** 2)))
 
 
@@ -229,11 +229,11 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(
         database.execute("CREATE TABLE kept (row)")
     database.close()
 
-    def listed_then_moved(work: Path, place: Path) -> None:
+    def listed_then_moved(work: Path, folder: Path) -> None:
         with sqlite3.connect(work / "database.db") as database:
             tables.extend(name for (name,) in database.execute("SELECT name FROM sqlite_master"))
         database.close()
-        move_into_place(work, place)
+        move_into_place(work, folder)
 
     monkeypatch.setattr(pipeline, "move_into_place", listed_then_moved)
     prepare_scene(photos, out, progress=False)
@@ -255,10 +255,10 @@ def test_an_interruption_while_scenes_change_places_is_made_good(
             raise KeyboardInterrupt
         return rename(path, target)
 
-    def write(place: Path, text: str) -> None:
+    def write(folder: Path, text: str) -> None:
         for name in ("images", "sparse"):
-            (place / name).mkdir(parents=True, exist_ok=True)
-            (place / name / "file").write_text(text)
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            (folder / name / "file").write_text(text)
 
     write(out, "old")
     write(work / "scene", "new")

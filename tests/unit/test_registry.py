@@ -72,9 +72,9 @@ def test_entries_that_are_no_supervision_are_one_line(name: str, message: str) -
 
 
 @pytest.mark.usefixtures("_package")
-@pytest.mark.parametrize(("name", "found"), [("number", "a int"), ("other", "Halved")])
-def test_entries_that_are_no_adapter_are_one_line(name: str, found: str) -> None:
-    with pytest.raises(UserInputError, match=f"{found}, expected a subclass of BackboneAdapter; fix or uninstall"):
+@pytest.mark.parametrize(("name", "received"), [("number", "a int"), ("other", "Halved")])
+def test_entries_that_are_no_adapter_are_one_line(name: str, received: str) -> None:
+    with pytest.raises(UserInputError, match=f"{received}, expected a subclass of BackboneAdapter; fix or uninstall"):
         adapter_class(Path(), name)
 
 
@@ -122,7 +122,7 @@ def adapter(name: str, *own_files: str, fork_of: tuple[str, ...] = ()) -> type[B
 
 
 @pytest.mark.parametrize(
-    ("files", "known", "found"),
+    ("files", "known", "received"),
     [
         ((), [adapter("plain")], "plain"),
         (("a.py",), [adapter("plain"), adapter("fork", "a.py")], "fork"),
@@ -134,7 +134,7 @@ def adapter(name: str, *own_files: str, fork_of: tuple[str, ...] = ()) -> type[B
 def test_a_fork_wins_against_the_code_it_was_forked_from(
     files: tuple[str, ...],
     known: list[type[BackboneAdapter]],
-    found: str,
+    received: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -142,7 +142,7 @@ def test_a_fork_wins_against_the_code_it_was_forked_from(
     monkeypatch.setattr(backbones, "all_adapters", lambda: tuple(known))
     recognised = recognise(tmp_path)
     assert recognised is not None
-    assert recognised.info.name == found
+    assert recognised.info.name == received
 
 
 def test_two_backbones_that_both_recognise_a_checkout_are_named(

@@ -96,8 +96,12 @@ def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 
 
-def assert_one_line(caught: pytest.ExceptionInfo[Exception]) -> None:
+def refused(path: Path, message: str, **options: Any) -> str:
+    """Check that a scene is refused in one line, and return the line."""
+    with pytest.raises(SceneError, match=message) as caught:
+        load(path, **options)
     assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 # Cameras
@@ -176,11 +180,7 @@ def test_pre_resized_photos_rescale_the_camera(tmp_path: Path, size: tuple[int, 
 def test_size_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int]) -> None:
     path = make_scene(tmp_path)
     write_images(path / "images", {"03.png": size})
-    with pytest.raises(
-        SceneError, match=rf"03\.png: the image is {size[0]}x{size[1]} pixels, its camera 96x64"
-    ) as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, rf"03\.png: the image is {size[0]}x{size[1]} pixels, its camera 96x64")
 
 
 def test_views_may_differ_in_size(tmp_path: Path) -> None:
@@ -243,13 +243,9 @@ def test_names_of_photos_from_phones_and_other_systems(tmp_path: Path, binary: b
     (path / "images" / names[2]).rename(path / "images" / "cam 2" / "X.jpg")
     assert tuple(view.name for view in load(path).train) == names
     (path / "images" / "cam 2" / "x.jpg").write_bytes(b"")
-    with pytest.raises(SceneError, match=r"cam 2/x\.JPG: no such image; put it there"):
-        load(path)  # two files differ in case alone
+    refused(path, r"cam 2/x\.JPG: no such image; put it there")  # two files differ in case alone
     (path / "images" / names[0]).unlink()
-    with pytest.raises(
-        SceneError, match=r"IMG 01\.png: no such image \(2 of 3 are missing\).*, or leave them out with"
-    ):
-        load(path)
+    refused(path, r"IMG 01\.png: no such image \(2 of 3 are missing\).*, or leave them out with")
 
 
 def test_smaller_copies_may_have_another_format(tmp_path: Path) -> None:
@@ -263,15 +259,13 @@ def test_smaller_copies_may_have_another_format(tmp_path: Path) -> None:
         assert view.camera.size == (24, 16)
         torch.testing.assert_close(view.image, torch.full((3, 16, 24), sum(name.encode()) % 256 / 255.0))
     (path / "images_4_png" / "a.1.bmp").write_bytes(b"")
-    with pytest.raises(SceneError, match=r"images_4_png/a\.1\.JPG: no such image"):
-        load(path, images="images_4_png")
+    refused(path, r"images_4_png/a\.1\.JPG: no such image", images="images_4_png")
 
 
 def test_two_names_of_one_photo_are_refused(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(("a.png", "A.png", "c.png")))
     (path / "images" / "A.png").unlink()
-    with pytest.raises(SceneError, match=r"image A\.png is listed twice"):
-        load(path)
+    refused(path, r"image A\.png is listed twice")
 
 
 def test_photos_that_are_not_in_the_model_are_left_out(tmp_path: Path) -> None:
@@ -345,16 +339,12 @@ def overwrite(file: Path, old: float, new: float) -> None:
 )
 def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: str) -> None:
     path = make_scene(tmp_path, Model(cameras={1: camera}))
-    with pytest.raises(SceneError, match=message + ".*`lapgs prepare") as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, message + ".*`lapgs prepare")
 
 
 def test_photos_that_see_all_around_cannot_be_undistorted(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(cameras={1: "EQUIRECTANGULAR 96 64 96 64"}))
-    with pytest.raises(SceneError, match="sees all around, which no pinhole image shows; cut") as caught:
-        load(path)
-    assert "lapgs prepare" not in str(caught.value)
+    assert "lapgs prepare" not in refused(path, "sees all around")
 
 
 def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:
@@ -380,37 +370,30 @@ def test_distorted_camera_that_no_image_uses_does_not_matter(tmp_path: Path) -> 
 def test_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "none", tmp_path / "file"):
-        with pytest.raises(SceneError, match=f"{path.name}: no such scene folder"):
-            load(path)
+        refused(path, f"{path.name}: no such scene folder")
 
 
 def test_neither_model_nor_transforms(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"neither a COLMAP model .* nor transforms\.json.*`lapgs prepare") as caught:
-        load(tmp_path)
-    assert_one_line(caught)
+    refused(tmp_path, r"neither a COLMAP model .* nor transforms\.json.*`lapgs prepare")
 
 
 @pytest.mark.parametrize("name", ["garden", "dense/0"])
 def test_a_folder_around_a_scene_is_told_where_it_is(tmp_path: Path, name: str) -> None:
     (tmp_path / name / "sparse" / "0").mkdir(parents=True)
     (tmp_path / name / "sparse" / "0" / "cameras.bin").write_bytes(b"")
-    with pytest.raises(SceneError, match=rf"neither .* in it; give \S+/{name}, which has one"):
-        load(tmp_path)
+    refused(tmp_path, rf"neither .* in it; give \S+/{name}, which has one")
 
 
 @pytest.mark.parametrize("name", ["images", "sparse", "sparse/0"])
 def test_a_folder_in_a_scene_is_told_which_it_is(tmp_path: Path, name: str) -> None:
     path = make_scene(tmp_path / "garden")
-    with pytest.raises(SceneError, match=rf"garden/{name}: neither .* in it; give \S+/garden, which has one"):
-        load(path / name)
+    refused(path / name, rf"garden/{name}: neither .* in it; give \S+/garden, which has one")
 
 
 def test_photos_of_a_polycam_export_are_to_be_prepared(tmp_path: Path) -> None:
     write_images(tmp_path, {"one.png": (8, 8), "keyframes/images/1.png": (8, 8)})
-    with pytest.raises(SceneError, match=r"make a scene from photos with `lapgs prepare \S+/keyframes/images OUT`"):
-        load(tmp_path)
-    with pytest.raises(SceneError, match=r"`lapgs prepare \S+/keyframes/images OUT`"):
-        load(tmp_path / "keyframes" / "images")
+    refused(tmp_path, r"make a scene from photos with `lapgs prepare \S+/keyframes/images OUT`")
+    refused(tmp_path / "keyframes" / "images", r"`lapgs prepare \S+/keyframes/images OUT`")
 
 
 def test_a_model_beside_its_photos_is_to_be_prepared(tmp_path: Path) -> None:
@@ -419,8 +402,7 @@ def test_a_model_beside_its_photos_is_to_be_prepared(tmp_path: Path) -> None:
     (path / "sparse/0").rename(tmp_path / "model")
     for file in (*(tmp_path / "model").iterdir(), *(path / "images").iterdir()):
         file.rename(path / file.name)
-    with pytest.raises(SceneError, match=f"its model with `lapgs prepare {path} OUT --model {path}`"):
-        load(path)
+    refused(path, f"its model with `lapgs prepare {path} OUT --model {path}`")
     prepare_scene(path, tmp_path / "out", PrepareSettings(model=path), progress=False)
     assert len(load(tmp_path / "out").train) == 10
 
@@ -435,10 +417,7 @@ def test_wrong_resolution_comes_first(tmp_path: Path) -> None:
 def test_incomplete_model(tmp_path: Path, name: str, binary: bool) -> None:
     path = make_scene(tmp_path, binary=binary)
     (path / "sparse" / "0" / f"{name}.{'bin' if binary else 'txt'}").unlink()
-    with pytest.raises(SceneError, match="the sparse model is incomplete, it has only") as caught:
-        load(path)
-    assert name not in str(caught.value).split("it has only")[1].split(";")[0]
-    assert_one_line(caught)
+    assert name not in refused(path, "the sparse model is incomplete").split("it has only")[1].split(";")[0]
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
@@ -458,19 +437,16 @@ def test_binary_file_cut_anywhere_is_told(tmp_path: Path, name: str) -> None:
             (line,) = read_colmap(path, folder, "images", evaluate=False).warnings
             assert f"{folder}/frames.bin: damaged" in line
             continue
-        with pytest.raises(SceneError) as caught:
+        with pytest.raises(SceneError, match=re.escape(file.name)) as caught:
             read_colmap(path, folder, "images", evaluate=False)
-        assert file.name in str(caught.value)
-        assert_one_line(caught)
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images"])
 def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
     path = make_scene(tmp_path, binary=False)
     (path / "sparse" / "0" / f"{name}.txt").write_text("these are not numbers\n\n" * 3)
-    with pytest.raises(SceneError, match=rf"{name}\.txt: line 1 is 'these are not numbers', expected ") as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, rf"{name}\.txt: line 1 is 'these are not numbers', expected ")
 
 
 def test_a_model_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -481,24 +457,14 @@ def test_a_model_without_points_starts_from_random_ones(tmp_path: Path, caplog: 
     assert scene.train[0].camera.position.norm() / 2 < reach
 
 
-def test_points_with_nan(tmp_path: Path) -> None:
-    path = make_scene(tmp_path)
-    overwrite(path / "sparse" / "0" / "points3D.bin", POINTS[3, 1], np.nan)
-    with pytest.raises(SceneError, match="there are no sparse points, or they hold NaN or inf"):
-        load(path)
-
-
 def test_image_folder_that_is_not_there(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
-    with pytest.raises(SceneError, match="images_4: no such folder of images; choose images with --images"):
-        load(path, images="images_4")
+    refused(path, "images_4: no such folder of images; choose images with --images", images="images_4")
     (path / "images").rename(path / "Fotos März")
-    with pytest.raises(SceneError, match="images: no such folder of images; choose Fotos März with --images"):
-        load(path)
+    refused(path, "images: no such folder of images; choose Fotos März with --images")
     assert len(load(path, images="Fotos März").train) == len(Model().names)
     shutil.rmtree(path / "Fotos März")
-    with pytest.raises(SceneError, match="images: no such folder of images; put the photos"):
-        load(path)
+    refused(path, "images: no such folder of images; put the photos")
 
 
 @pytest.mark.parametrize(
@@ -508,8 +474,7 @@ def test_files_that_a_clone_without_git_lfs_lacks(tmp_path: Path, name: str) -> 
     path = make_scene(tmp_path)
     pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 128\n"
     (path / name).write_text(pointer)
-    with pytest.raises(SceneError, match=rf"{name}: a pointer of Git LFS, .*`git lfs pull`"):
-        load(path)
+    refused(path, rf"{name}: a pointer of Git LFS, .*`git lfs pull`")
 
 
 @pytest.mark.parametrize("how", ["missing", "empty", "cut"])
@@ -520,9 +485,7 @@ def test_image_that_cannot_be_read_is_named(tmp_path: Path, how: str) -> None:
     file.unlink()
     if how != "missing":
         file.write_bytes(content[: len(content) - 20] if how == "cut" else b"")
-    with pytest.raises(SceneError, match=r"images/06\.png: ") as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, r"images/06\.png: ")
 
 
 def test_first_of_several_broken_images_is_the_one_named(tmp_path: Path) -> None:
@@ -530,36 +493,30 @@ def test_first_of_several_broken_images_is_the_one_named(tmp_path: Path) -> None
     for name in ("08.png", "04.png", "05.png"):
         file = path / "images" / name
         file.write_bytes(file.read_bytes()[:-20])  # the header is whole: found when the pixels are read
-    with pytest.raises(SceneError, match=r"images/04\.png: the image is damaged or cut short"):
-        load(path)
+    refused(path, r"images/04\.png: the image is damaged or cut short")
 
 
 def test_fewer_than_two_training_views(tmp_path: Path) -> None:
     one = make_scene(tmp_path / "one", Model(names=["a.png"]))
-    with pytest.raises(SceneError, match="1 training view, expected at least 2; add photos"):
-        load(one)
+    refused(one, "1 training view, expected at least 2; add photos")
     two = make_scene(tmp_path / "two", Model(names=["a.png", "b.png"]))
     assert len(load(two).train) == 2
-    with pytest.raises(
-        SceneError, match="1 training view besides 1 held out, expected at least 2; train without --eval"
-    ):
-        load(two, eval=True)
+    refused(two, "1 training view besides 1 held out, expected at least 2; train without --eval", eval=True)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_nan_pose(tmp_path: Path, value: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("points3D", POINTS[3, 1], np.nan, "sparse points, or they hold NaN or inf"),
+        ("images", Model().pose(4)[1][2], np.nan, r"the camera of 04\.png has NaN or inf"),
+        ("images", Model().pose(4)[1][2], np.inf, r"the camera of 04\.png has NaN or inf"),
+        *(("cameras", 82.0, focal, r"the camera of 0\d\.png") for focal in (np.nan, 0.0, -5.0)),
+    ],
+)
+def test_numbers_that_cannot_be_used(tmp_path: Path, name: str, old: float, new: float, message: str) -> None:
     path = make_scene(tmp_path)
-    overwrite(path / "sparse" / "0" / "images.bin", Model().pose(4)[1][2], value)
-    with pytest.raises(SceneError, match=r"the camera of 04\.png has NaN or inf"):
-        load(path)
-
-
-@pytest.mark.parametrize("value", [np.nan, 0.0, -5.0])
-def test_focal_length_that_is_no_positive_number(tmp_path: Path, value: float) -> None:
-    path = make_scene(tmp_path)
-    overwrite(path / "sparse" / "0" / "cameras.bin", 82.0, value)
-    with pytest.raises(SceneError, match=r"the camera of 0\d\.png"):
-        load(path)
+    overwrite(path / "sparse" / "0" / f"{name}.bin", old, new)
+    refused(path, message)
 
 
 def test_all_cameras_at_one_point(tmp_path: Path) -> None:
@@ -576,8 +533,7 @@ def test_same_name_twice(tmp_path: Path) -> None:
     path = make_scene(tmp_path, binary=False)
     file = path / "sparse" / "0" / "images.txt"
     file.write_text(file.read_text().replace("07.png", "06.png"))
-    with pytest.raises(SceneError, match=r"06\.png is listed twice|cannot be read"):
-        load(path)
+    refused(path, r"06\.png is listed twice|cannot be read")
 
 
 @pytest.mark.parametrize("name", ["../beside.png", "/tmp/elsewhere.png"])
@@ -585,8 +541,7 @@ def test_names_that_lead_out_of_the_scene(tmp_path: Path, name: str) -> None:
     path = tmp_path / "scene"
     Model(names=["a.png", "b.png", name]).write(path / "sparse" / "0")
     write_images(path / "images", {"a.png": (96, 64), "b.png": (96, 64)})
-    with pytest.raises(SceneError, match="is named by a path outside the scene"):
-        load(path)
+    refused(path, "is named by a path outside the scene")
 
 
 def test_names_that_no_file_can_have(tmp_path: Path) -> None:
@@ -609,9 +564,7 @@ def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
     path = make_scene(tmp_path)
     model = path / "sparse" / "0" / "images.bin"
     model.write_bytes(model.read_bytes().replace(b"03.png", b"\xff\xfe.png"))
-    with pytest.raises(SceneError, match=r"the name of image \d+ is b'\\xff\\xfe\.png.*', expected UTF-8") as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, r"the name of image \d+ is b'\\xff\\xfe\.png.*', expected UTF-8")
 
 
 @pytest.mark.parametrize(
@@ -679,9 +632,7 @@ def test_text_models_name_the_line(tmp_path: Path, file: str, old: str, new: str
     before = text.read_text()
     text.write_text(re.sub(old, new, before, count=1, flags=re.MULTILINE))
     assert text.read_text() != before
-    with pytest.raises(SceneError, match=message) as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, message)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
@@ -690,9 +641,7 @@ def test_absurd_counts_of_binary_files(tmp_path: Path, name: str, count: int) ->
     path = make_scene(tmp_path)
     file = path / "sparse" / "0" / f"{name}.bin"
     file.write_bytes(struct.pack("<Q", count) + file.read_bytes()[8:])
-    with pytest.raises(SceneError, match=rf"{name}\.bin: the file is damaged or cut short at \d+ bytes") as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, rf"{name}\.bin: the file is damaged or cut short at \d+ bytes")
 
 
 @pytest.mark.parametrize(
@@ -714,9 +663,7 @@ def test_values_of_binary_files(tmp_path: Path, name: str, offset: int, value: b
     content = bytearray(file.read_bytes())
     content[offset : offset + len(value)] = value
     file.write_bytes(content)
-    with pytest.raises(SceneError, match=message) as caught:
-        load(path)
-    assert_one_line(caught)
+    refused(path, message)
 
 
 # A real scene

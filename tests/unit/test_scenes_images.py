@@ -384,7 +384,7 @@ def test_bytes_between_the_parts_of_a_jpeg(
 
 def test_a_jpeg_that_ends_early_or_holds_wrong_bits(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path, content = tmp_path / "a.jpg", jpeg(restart_marker_rows=1)
-    first, second = (found.start() for found in list(re.finditer(rb"\xff[\xd0-\xd7]", content))[:2])
+    first, second = (marker.start() for marker in list(re.finditer(rb"\xff[\xd0-\xd7]", content))[:2])
     for end in (first, first - 20, second + 30):
         path.write_bytes(content[:end] + b"\xff\xd9")
         with pytest.raises(SceneError, match=r"a\.jpg: the image is damaged or cut short"):

@@ -75,11 +75,11 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     printed = []
     for line in process.stdout:
         printed.append(line)
-        if found := re.search(r"http://\S+", line):
+        if url := re.search(r"http://\S+", line):
             break
     else:
         pytest.fail("the viewer did not start: " + "".join(printed))
-    yield found[0]
+    yield url[0]
     process.send_signal(signal.SIGINT)
     rest, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, rest

@@ -114,8 +114,8 @@ def test_on_all_addresses_any_address_is_accepted_but_no_foreign_name(open_page:
 
 
 def test_the_given_host_is_accepted_with_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: found)
+    entries = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: entries)
     monkeypatch.setattr(socket, "getfqdn", lambda: "gpu.lab.example")
     guard = Guard("Viewer.Example")
     wait_for(lambda: guard._knows("gpu.lab.example"))
