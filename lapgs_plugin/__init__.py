@@ -1,7 +1,7 @@
 """Train 3D Gaussian Splatting codebases faster with Laplacian frequency hierarchies.
 
-The names below are for programs; `lapgs help python` shows what they do together. Each is imported at its first use, so
-that importing this package, and with it `lapgs --help`, imports neither torch nor a backbone.
+The names below are for programs; `lapgs help python` shows how to use them together. Each is imported at its first use,
+so that importing this package, and with it `lapgs --help`, imports neither torch nor a backbone.
 """
 
 from __future__ import annotations

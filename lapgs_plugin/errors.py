@@ -39,7 +39,7 @@ def one_line(text: str) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """Return a number with what it counts, in the plural unless it is one.
+    """Return a number with the counted thing, in the plural unless it is one.
 
     >>> counted(1, "photo"), counted(0, "photo")
     ('1 photo', '0 photos')
@@ -48,7 +48,7 @@ def counted(number: int, thing: str) -> str:
 
 
 def nearest(name: str, known: Set[str], otherwise: str = "") -> str:
-    """Suggest the nearest known name; without one say `otherwise`, or list all of them.
+    """Suggest the nearest known name; without a near one return `otherwise`, or list all names.
 
     >>> nearest("iteratons", {"iterations", "seed"}), nearest("x", {"iterations", "seed"})
     ('did you mean iterations?', 'expected one of iterations, seed')
@@ -75,7 +75,7 @@ def typed_line(error: BaseException) -> str:
 class LapgsError(Exception):
     """An error that one line explains; the command line prints it and exits with `exit_code`.
 
-    The message says what was wrong, the value received, what was expected and what to do next. It is always one
+    The message holds the mistake, the value received, the expectation and the next step. It is always one
     printable line; an error about several mistakes has a line for each.
     """
 
@@ -143,7 +143,7 @@ def require_extra(module: str, extra: str, subject: str, otherwise: str = "") ->
         module: of the package.
         extra: of lapgs_plugin that brings it.
         subject: of the message: the file, command or option that needs it.
-        otherwise: what to do without it.
+        otherwise: alternative without it.
 
     Raises:
         MissingExtraError: it is not installed.

@@ -130,7 +130,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def one_line_errors(path: Path, action: str = "written", *, training: bool = False) -> Iterator[None]:
-    """Turn an OSError about a file into a RunFolderError that says what to do.
+    """Turn an OSError about a file into a RunFolderError with advice.
 
     Args:
         path: of the file.
@@ -295,7 +295,7 @@ else:
     import fcntl
 
     def _try_lock(descriptor: int) -> bool | None:
-        """Lock an open file or folder without waiting; return what `lock` returns."""
+        """Lock an open file or folder as `lock`, without waiting."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -31,7 +31,7 @@ SAME_PRESS = 0.5
 """Seconds in which another signal counts as the first: wrappers forward a Ctrl-C that the terminal sent to both."""
 
 _SHOW_CURSOR = "\x1b[?25h"
-"""Terminal code that undoes what progress bars do."""
+"""Terminal code that shows the cursor, which progress bars hide."""
 
 
 class Interrupted(KeyboardInterrupt):

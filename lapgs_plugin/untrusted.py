@@ -1,7 +1,7 @@
 """Read JSON and TOML that may be damaged, edited by hand or malicious.
 
 All of this package reads such files here. Size, nesting and numbers are limited first; then values are validated
-against a type. Every error is one line that names the file, the key, the value, what was expected and what to do.
+against a type. Every error is one line with the file, the key, the value, the expectation and advice.
 Readers of other formats call `require_regular` before they open a file.
 
 A type is anything that pydantic validates. Dataclasses with `STRICT` as their `__pydantic_config__`, and dictionaries
@@ -103,7 +103,7 @@ def read_json(
         path: of the file.
         kind: type of its value; Any accepts all JSON.
         error: class to raise.
-        advice: what to do about a damaged file; ends the message.
+        advice: about a damaged file; ends the message.
         finite: refuse NaN and Infinity, which are not JSON but which some programs write.
 
     Returns:
@@ -203,7 +203,7 @@ def checked(
         kind: type to convert to.
         name: of the source, for messages.
         error: class to raise.
-        advice: what to do; ends the message.
+        advice: ends the message.
         finite: refuse NaN and Infinity.
 
     Raises:
@@ -274,7 +274,7 @@ def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError]
     try:
         require_regular(path)
         with path.open("rb") as stream:
-            # In parts: a single read would allocate all that it asks for.
+            # In parts, because a single read would allocate its whole limit.
             while len(data) <= limit and (part := stream.read(MIB)):
                 data += part
     except (OSError, ValueError) as cause:  # ValueError: a NUL in the path
@@ -305,7 +305,7 @@ def _require_plain(value: Any, name: str, error: type[UserInputError], advice: s
 
 
 def _unusable(value: Any, finite: bool) -> str | None:
-    """Return what is wrong with a value that is neither table nor list; None if nothing is."""
+    """Describe the problem of a value that is neither table nor list; None without one."""
     if isinstance(value, str):
         # A lone surrogate, from a file name that is not UTF-8 or from an escape.
         broken = not value.isascii() and re.search("[\ud800-\udfff]", value)
@@ -326,7 +326,7 @@ def _digits(value: int) -> str:
 
 
 def problem(error: ValidationError) -> str:
-    """Describe the first problem: its key, its value and what was expected."""
+    """Describe the first problem: its key, its value and the expectation."""
     first = error.errors(include_url=False)[0]
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
     where = where if len(where) <= 120 else where[:117] + "..."

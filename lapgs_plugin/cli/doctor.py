@@ -43,7 +43,7 @@ def doctor(
     """Check Python, PyTorch, GPU, compilers and packages, and name the rasterizer of `lapgs train`.
 
     With a checkout, describe it: its root, its training function, its rasterizers, and the kinds of levels that work.
-    Nothing is changed or downloaded. Lines marked !! are problems and say what to do; lines marked -- are optional
+    Nothing is changed or downloaded. Lines marked !! are problems with advice; lines marked -- are optional
     parts that are not installed. The exit code is 0 unless CHECKOUT is not a checkout.
     """
     from dataclasses import asdict

@@ -25,7 +25,7 @@ SHOWN_VIEWS = 12
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """Choose what is measured: images of the views, or flicker along a camera path.
+    """Choose the measurement: images of the views, or flicker along a camera path.
 
     Raises:
         UserInputError: a value is out of range, or an option has no effect with the others.

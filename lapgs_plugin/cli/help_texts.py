@@ -40,6 +40,6 @@ def module_summary(module: str) -> str:
         for name in below:
             spec = PathFinder.find_spec(f"{spec.name}.{name}", spec.submodule_search_locations)
         text = ast.get_docstring(ast.parse(spec.loader.get_source(spec.name))) or module
-    except (ImportError, AttributeError, SyntaxError, TypeError, ValueError):  # calling the command says what is wrong
+    except (ImportError, AttributeError, SyntaxError, TypeError, ValueError):  # calling the command explains the error
         text = module
     return text.split("\n")[0].replace("[", r"\[")  # no markup

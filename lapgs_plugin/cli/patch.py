@@ -57,7 +57,7 @@ AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files
 
 @app.command("status")
 def status_(checkout: Checkout, set_name: SetName = "all") -> None:
-    """Show which edits are applied, which can be applied, and what prevents the others."""
+    """Show which edits are applied, which can be applied, and why others cannot."""
     chosen = _targets(checkout, set_name, opt_in=True)
     with _alone(chosen):
         for target, sets in chosen:

@@ -14,7 +14,7 @@ class Rehearsal:
     """Receive the checked options of a command. With a Rehearsal as its context's object, a command ends there."""
 
     def train(self, request: TrainRequest) -> None:
-        """Receive what a command line of `lapgs train` asks for."""
+        """Receive the request of a command line of `lapgs train`."""
 
     def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
         """Receive the settings of `lapgs run` and the script's own arguments."""

@@ -106,9 +106,9 @@ def render(
     """Render the base, the residuals and the composition of RUN, for its views or along a camera path.
 
     Files are named <view>_base, <view>_residual_<level> and <view>_composed, in the folders test and train. Base and
-    residuals have the size of their level. Nested levels have no residuals: <view>_difference_<level> is what a level
-    changes in the upsampled image of the level before. PNG files show residuals and differences around mid-grey: grey
-    is zero, lighter is positive, darker is negative.
+    residuals have the size of their level. Nested levels have no residuals: <view>_difference_<level> is the difference
+    of a level from the upsampled image of the level before. PNG files show residuals and differences around mid-grey:
+    grey is zero, lighter is positive, darker is negative.
 
     Examples:
 

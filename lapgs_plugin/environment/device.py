@@ -11,7 +11,7 @@ def chosen_device(device: str, advice: str = "`lapgs doctor` says why, or use --
     """Return "cuda" or "cpu" for a value of --device; "auto" takes CUDA if there is a device.
 
     Raises:
-        UserInputError: an unknown value, or CUDA without a device; `advice` says what to do then.
+        UserInputError: an unknown value, or CUDA without a device; `advice` ends that message.
     """
     if device not in DEVICES:
         raise UserInputError(f"--device {device}: expected {', '.join(DEVICES)}")

@@ -39,7 +39,7 @@ VARIABLES = (
     "NUMBA_DISABLE_JIT",
     "OMP_NUM_THREADS",
 )
-"""Environment variables that change what is used, or its speed."""
+"""Environment variables that change the choice of hardware and programs, or speed."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ ENTRY_POINT_GROUPS = {
     f"{PACKAGE}.reports": "lapgs report, of folders of kind {}",
     "lapgs.commands": "lapgs {}",
 }
-"""Groups of entry points through which other packages extend this one, and what each adds."""
+"""Groups of entry points through which other packages extend this one, with the use of their entries."""
 
 
 def entry_point_findings() -> list[Finding]:

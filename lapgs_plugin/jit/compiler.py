@@ -1,4 +1,4 @@
-"""Compile kernels with Numba, keep their machine code on disk, and say when compilation makes the user wait."""
+"""Compile kernels with Numba, keep their machine code on disk, and print a line when the user waits for that."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ Any other insertion, and every replacement, stands between two comments, the fir
 
     /*>>> lapgs SET/NAME CHECKSUM was: the old text*/the text/*<<< lapgs*/
 
-The checksum, which ignores white space, tells whether the block was changed after it was written.
+The checksum, which ignores white space, shows whether the block was changed after it was written.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
         for path in sorted(temporary for file in files if file.parent in locked for temporary in _temporaries(file)):
             try:
                 path.unlink(missing_ok=True)
-            except OSError:  # a read-only folder: the caller says so, and the command may still work
+            except OSError:  # a read-only folder: the caller reports it, and the command may still work
                 stuck.append(path)
         yield stuck
 

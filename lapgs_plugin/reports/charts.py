@@ -32,7 +32,7 @@ def count_text(value: float) -> str:
 
 
 def number_text(value: float) -> str:
-    """Format a number with three digits, or with all that are before its point."""
+    """Format a number with three significant digits, or all digits before its point."""
     return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 

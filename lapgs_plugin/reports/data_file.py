@@ -40,7 +40,7 @@ def data_row(run: MeasuredRun, moved_to: Path | None = None) -> Row:
 
     Args:
         run: the run.
-        moved_to: current folder of the scene; None if it is where the manifest says.
+        moved_to: current folder of the scene; None for that of the manifest.
 
     Raises:
         RunFolderError, SceneError: the scene is not the run's, or cannot be read.

@@ -1,6 +1,6 @@
 """Read and write scenes: COLMAP and Blender-style folders, their images and image sizes.
 
-What loads scenes is imported on first use, because `resolution` must work without the packages that read images.
+Functions that load scenes are imported on first use: `resolution` must work without the packages that read images.
 """
 
 from __future__ import annotations

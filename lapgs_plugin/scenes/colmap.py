@@ -127,7 +127,7 @@ def source_of(model: Model, folder: Path) -> SceneSource:
 
 
 def why_no_points(path: Path) -> str:
-    """Return why a codebase of 3DGS finds no points in a scene folder, and what to do about it, in one line."""
+    """Return the reason why a codebase of 3DGS finds no points in a scene folder, with advice, in one line."""
     model = find_model(path)
     ply, train = (model or path) / f"points3{'D' if model else 'd'}.ply", f"`lapgs train {quote(str(path))}`"
     in_model = in_ply = 0

@@ -1,4 +1,4 @@
-"""Read COLMAP's rigs and frames, which hold the poses of images once more, to tell whether they are outdated.
+"""Read COLMAP's rigs and frames, which hold the poses of images again, to find out whether they are outdated.
 
 COLMAP writes them since version 3.12, and prefers their poses to those of the images' file. Codebases of 3DGS, and
 scripts that edit models, know the latter alone. The layout is that of COLMAP's reconstruction_io_binary.cc, and the

@@ -1,6 +1,6 @@
 """Read sparse models of COLMAP as codebases of 3DGS do: cameras, images and points are the truth.
 
-Other files of a model may be outdated, because scripts that edit models do not know them. A line says so.
+Other files of a model may be outdated, because scripts that edit models do not know them. A warning names them.
 """
 
 from __future__ import annotations

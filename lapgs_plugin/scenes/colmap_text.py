@@ -1,8 +1,8 @@
 """Read COLMAP's text files (https://colmap.github.io/format.html), as COLMAP writes them and as people do.
 
 pycolmap ends a name at its first space, reads -96 pixels as 18446744073709551520, and refuses tracks that do not agree
-with the images. Training uses no tracks, so that lines of images.txt are told apart by what they hold: COLMAP writes
-two for each image, others one, or with empty lines in between.
+with the images. Lines of images.txt are told apart by their contents: COLMAP writes two for each image, other programs
+write one, or empty lines in between.
 """
 
 from __future__ import annotations

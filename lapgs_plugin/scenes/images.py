@@ -69,7 +69,7 @@ def find_image(path: Path) -> Path:
 def _by_plain_name(folder: Path, changed: int) -> dict[str, list[Path]]:
     """Return the files of a folder by `_plain` name, and photos by `_any_format`. `changed` renews the cache."""
     files: dict[str, list[Path]] = {}
-    with suppress(PermissionError):  # opening the image says so
+    with suppress(PermissionError):  # opening the image will fail with a message
         for file in filter(is_file, folder.iterdir()):
             files.setdefault(_plain(file.name), []).append(file)
             if is_photo(file):
@@ -198,7 +198,7 @@ def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, flo
     Raises:
         SceneError: the file is missing, no image, cut short, or has more pixels than `limits.PHOTO_PIXELS`.
     """
-    image_size(path)  # says what is wrong with damaged files
+    image_size(path)  # refuses damaged files with a reason
     why = "Pillow, with which 3DGS codebases read images, cannot read it, expected a whole 8-bit image"
     with open_by_pillow(path, why) as source:
         source.load()

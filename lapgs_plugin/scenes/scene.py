@@ -82,7 +82,7 @@ class View:
     """An image and its camera.
 
     `image` and `mask` may be given as functions without arguments, which are called at each access: such a view takes
-    no memory. `dataclasses.replace` would keep what they return; `at` does not.
+    no memory. `at` keeps the functions; `dataclasses.replace` would keep their results.
 
     Attributes:
         name: unique name of the image, such as "0001.jpg" or "train/r_0.png", relative to the image folder of a COLMAP

@@ -108,7 +108,9 @@ class SceneCameras:
     @classmethod
     def of(cls, archive: RunArchive, moved_to: Path | None = None) -> SceneCameras:
         """Read the cameras of a run; arguments and errors as `rendering.run.run_cameras`."""
-        from lapgs_plugin.rendering.run import run_cameras  # a backbone's environment may lack what reads scenes
+        from lapgs_plugin.rendering.run import (
+            run_cameras,
+        )  # a backbone's environment may lack packages that read scenes
 
         train, test = run_cameras(archive, moved_to)
         return cls({**test, **train}, Rig.of(list(train.values())))

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,23 @@ from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.run_folder import write_run, write_scene
 
 
-def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The line with which the command line ends."""
-    monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        command_line()
-    output = capfd.readouterr()
-    assert ended.value.code == 2
-    assert output.out == ""
-    (line,) = output.err.splitlines()
-    assert line.isprintable()
-    assert line.startswith("lapgs: ")
-    return line
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return a function that calls the command line, checks that it refuses, and returns its line."""
+
+    def call(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            command_line()
+        output = capfd.readouterr()
+        assert ended.value.code == 2
+        assert output.out == ""
+        (line,) = output.err.splitlines()
+        assert line.isprintable()
+        assert line.startswith("lapgs: ")
+        return line
+
+    return call
 
 
 def change(scene: Path, frame: int, **values: Any) -> None:
@@ -41,65 +47,53 @@ def change(scene: Path, frame: int, **values: Any) -> None:
     file.write_text(json.dumps(content))
 
 
-def test_values_that_training_cannot_square(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_values_that_training_cannot_square(tmp_path: Path, refused: Callable[..., str]) -> None:
     scene, out = write_scene(tmp_path / "scene"), tmp_path / "run"
     pose = np.eye(4)
     pose[1, 3] = 1e300
     whole = (scene / "transforms.json").read_text()
     change(scene, 3, transform_matrix=pose.tolist())
-    assert "frame 3 (photos/03.png) has 1e+300 in its transform_matrix" in refused(
-        *(monkeypatch, capfd, "train", scene, "-o", out)
-    )
+    assert "frame 3 (photos/03.png) has 1e+300 in its transform_matrix" in refused("train", scene, "-o", out)
     (scene / "transforms.json").write_text(whole)
     header = "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
     (scene / "points3d.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex 2\n{header}end_header\n0 0 0 1 1 1\n1 1 1 nan 0 0\n"
     )
-    assert "colours of the sparse points hold NaN" in refused(monkeypatch, capfd, "train", scene, "-o", out)
+    assert "colours of the sparse points hold NaN" in refused("train", scene, "-o", out)
     assert not out.exists()
 
 
-def test_names_with_escape_sequences(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_names_with_escape_sequences(tmp_path: Path, refused: Callable[..., str]) -> None:
     scene = write_scene(tmp_path / "scene")
     change(scene, 3, file_path="\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp")
-    line = refused(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run")
+    line = refused("train", scene, "-o", tmp_path / "run")
     assert r"\x1b]0;owned\x07\x1b[2J\nlapgs: done\r\u202egnp: no such image" in line
 
 
-def test_damaged_photos_and_a_file_instead_of_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_photos_and_a_file_instead_of_a_run(tmp_path: Path, refused: Callable[..., str]) -> None:
     """Libraries print and raise in ways of their own."""
     pillow_heif.register_heif_opener()
     scene = write_scene(tmp_path / "scene")
     photo = scene / "photos" / "03.png"
     photo.write_bytes(photo.read_bytes()[:-40])
     assert "photos/03.png: the image is damaged or cut short" in refused(
-        *(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run", "--iterations", 9)
+        "train", scene, "-o", tmp_path / "run", "--iterations", 9
     )
     pixels = io.BytesIO()
     Image.new("RGB", (96, 64)).save(pixels, "HEIF")
     start = pixels.getvalue().index(b"mdat") + 4
     (scene / "photos" / "04.heic").write_bytes(pixels.getvalue()[:start] + bytes(9000))
-    assert "04.heic: the photo cannot be decoded" in refused(
-        *(monkeypatch, capfd, "prepare", scene / "photos", tmp_path / "made")
-    )
+    assert "04.heic: the photo cannot be decoded" in refused("prepare", scene / "photos", tmp_path / "made")
     (tmp_path / "scene.ply").write_bytes(b"ply\n")
     for command in ("view", "render", "import-run"):
         out = ("-o", tmp_path / "run") if command == "import-run" else ()
-        assert "scene.ply is a file" in refused(monkeypatch, capfd, command, tmp_path / "scene.ply", *out)
+        assert "scene.ply is a file" in refused(command, tmp_path / "scene.ply", *out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene", "scene.ply"]
 
 
-def test_a_folder_whose_name_is_not_utf8(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_whose_name_is_not_utf8(tmp_path: Path, refused: Callable[..., str]) -> None:
     scene = tmp_path / os.fsdecode(b"scene\xff")
-    line = refused(monkeypatch, capfd, "train", scene, "-o", tmp_path / "run", "--rasterizer", "cpu")
+    line = refused("train", scene, "-o", tmp_path / "run", "--rasterizer", "cpu")
     assert r"scene\udcff: not UTF-8" in line
 
 
@@ -111,9 +105,7 @@ def test_the_table_of_views_prints_names_as_they_are_spelt(capsys: pytest.Captur
     assert r"[red]a\x1b[2J\nb.png" in capsys.readouterr().out
 
 
-def test_a_path_of_a_billion_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_path_of_a_billion_frames(tmp_path: Path, refused: Callable[..., str]) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
     wide = {"w": 10**5, "h": 10**5, "fl_x": 1e5, "frames": [{"transform_matrix": np.eye(4).tolist()}]}
     (tmp_path / "path.json").write_text(json.dumps(wide))
@@ -123,7 +115,7 @@ def test_a_path_of_a_billion_frames(
         (("--trajectory", tmp_path / "path.json"), "has 100000x100000 pixels, expected at most 128,000,000 pixels"),
     ):
         for command in (("render", run), ("eval", run)):
-            assert message in refused(monkeypatch, capfd, *command, *arguments)
+            assert message in refused(*command, *arguments)
     assert sorted(run.rglob("*")) == before
 
 
@@ -145,15 +137,11 @@ def test_a_path_of_a_billion_frames(
     ids=" ".join,
 )
 def test_links_to_themselves_pipes_and_devices_where_folders_are_expected(
-    command: tuple[str, ...],
-    odd: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    command: tuple[str, ...], odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_scene(tmp_path / "scene")
     Path("loop").symlink_to("loop")
     os.mkfifo("pipe")
-    assert odd in refused(monkeypatch, capfd, *(word.format(odd=odd) for word in command))
+    assert odd in refused(*(word.format(odd=odd) for word in command))
     assert not Path("out").exists()

@@ -31,6 +31,7 @@ from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run
 from tests.folders import files_in, snapshot
 from tests.mishaps import FailingWrites, disk_full
+from tests.refusals import refuses
 
 app = typer.Typer()
 for name, command in {
@@ -149,8 +150,7 @@ def test_lines_of_a_history(run: Path, scene: Path, line: bytes, message: str) -
     line_of = rf"history\.jsonl line {number} .*{message}"
     change(run / MANIFEST, "records", json.loads((run / MANIFEST).read_text())["records"][:1])
     refused(f"{line_of}.*; delete that line", "train", scene, "-o", run, "--resume", "--threads", "1")
-    with pytest.raises(LapgsError, match=line_of):
-        RunArchive.open(run).history()
+    refuses(LapgsError, line_of, RunArchive.open(run).history)
 
 
 def write_metrics(run: Path) -> None:
@@ -207,9 +207,8 @@ def test_a_full_disk_is_no_reason_to_resume(run: Path, command: str, monkeypatch
     if command == "report":
         write_metrics(run)
     FailingWrites(monkeypatch, disk_full).left = 0
-    with pytest.raises(LapgsError, match=r"free (some )?space and (run the command again|permissions)") as caught:
-        lapgs(command, run)
-    assert "--resume" not in str(caught.value)
+    line = refuses(LapgsError, r"free (some )?space and (run the command again|permissions)", lapgs, command, run)
+    assert "--resume" not in line
 
 
 @pytest.mark.parametrize("file", ["level_0", "level_0/point_cloud.ply", MANIFEST])
@@ -321,8 +320,7 @@ def test_files_of_a_foreign_run(tmp_path: Path, scene: Path, name: str, contents
 
 def test_a_folder_whose_name_cannot_be_kept_is_refused_before_training(tmp_path: Path, scene: Path) -> None:
     odd = tmp_path / os.fsdecode(b"\xff")
-    with pytest.raises(LapgsError, match=r"holds the text .*expected UTF-8"):
-        write_run(tmp_path / "run", odd)
+    refuses(LapgsError, r"holds the text .*expected UTF-8", write_run, tmp_path / "run", odd)
     assert not (tmp_path / "run").exists()
 
 

@@ -15,6 +15,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 from tests.folders import files_in
+from tests.refusals import refuses
 from tests.unit.test_spz import read_spz
 
 app = typer.Typer()
@@ -69,13 +70,10 @@ def test_spz_of_one_level(run: Path, tmp_path: Path) -> None:
 
 
 def test_mistakes(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match="--format splat: expected ply or spz"):
-        lapgs_export(run, "--format", "splat")
-    with pytest.raises(RunFolderError, match="level 7 is not in this run"):
-        lapgs_export(run, "--level", 7)
+    refuses(UserInputError, "--format splat: expected ply or spz", lapgs_export, run, "--format", "splat")
+    refuses(RunFolderError, "level 7 is not in this run", lapgs_export, run, "--level", 7)
     (tmp_path / "link").symlink_to("gone")
-    with pytest.raises(UserInputError, match=r"--out .*link is no folder; expected a folder"):
-        lapgs_export(run, "-o", tmp_path / "link")
+    refuses(UserInputError, r"--out .*link is no folder; expected a folder", lapgs_export, run, "-o", tmp_path / "link")
     (tmp_path / "file").touch()
     for merge in ((), ("--merge",)):  # before the fit, which takes minutes
         with pytest.raises(UserInputError, match=r"--out .*file is a file; expected a folder"):

@@ -29,6 +29,7 @@ from lapgs_plugin.training.prepared_run import PreparedRun
 from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
 from tests.folders import files_in
+from tests.refusals import refuses
 
 
 def _kept(run: Path, field: GaussianField) -> float:
@@ -93,8 +94,7 @@ def test_a_long_merge_edits_the_field_as_little_as_a_short_one(tmp_path: Path, m
     monkeypatch.setattr(merge, "Trainer", capture)
     archive = RunArchive.open(write_run(tmp_path / "run", write_scene(tmp_path / "scene")))
     for iterations in (3_000, 30_000):
-        with pytest.raises(UserInputError, match="far enough"):
-            merge.merge_levels(archive, iterations=iterations)
+        refuses(UserInputError, "far enough", merge.merge_levels, archive, iterations=iterations)
     assert settled[0] == settled[1]
     assert (settled[0].opacity_weight, settled[0].scale_weight) == (0.0, 0.0)
 
@@ -141,10 +141,8 @@ def test_runs_that_cannot_be_merged_are_one_line(tmp_path: Path) -> None:
     nested = write_run(tmp_path / "nested", scene, nested=True)
     with pytest.raises(UserInputError, match="level 0 is an ordinary field already, which needs no --merge"):
         lapgs_export(nested, "--merge")
-    with pytest.raises(UserInputError, match="--iterations needs --merge"):
-        lapgs_export(nested, "--iterations", 10)
-    with pytest.raises(UserInputError, match="--level does not go with --merge"):
-        lapgs_export(nested, "--merge", "--level", 0)
+    refuses(UserInputError, "--iterations needs --merge", lapgs_export, nested, "--iterations", 10)
+    refuses(UserInputError, "--level does not go with --merge", lapgs_export, nested, "--merge", "--level", 0)
     assert not (nested / "export").exists()
     with pytest.raises(RunFolderError, match="level 0 is not in this run"):
         lapgs_export(write_run(tmp_path / "half", scene, finished=1), "--merge")

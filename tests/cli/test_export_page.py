@@ -26,6 +26,7 @@ from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
 from tests.folders import files_in
 from tests.headless import CHROMIUM, NO_CHROMIUM, SOFTWARE_3D, headless_chromium
+from tests.refusals import refuses
 from tests.training_scene import HEIGHT, WIDTH, blob_field
 
 ENLARGED = 8
@@ -56,8 +57,7 @@ def test_splats_take_32_bytes_each_the_most_important_first() -> None:
     assert np.abs(splats["rgba"][0] / 255 - [*color, torch.sigmoid(field.opacity_logits[index])]).max() <= 0.51 / 255
     quaternion = torch.nn.functional.normalize(field.quaternions[index], dim=0).numpy()
     assert np.abs((splats["quaternion"][0] - 128.0) / 128 - quaternion).max() <= 1 / 128
-    with pytest.raises(FieldError, match="residual has signed colours"):
-        splat_bytes(replace(field, signed=True))
+    refuses(FieldError, "residual has signed colours", splat_bytes, replace(field, signed=True))
 
 
 def test_the_page_is_one_file_with_the_splats(run: Path) -> None:
@@ -80,10 +80,8 @@ def test_pages_that_cannot_be_made_are_one_line(tmp_path: Path) -> None:
     residuals = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
     with pytest.raises(UserInputError, match="level 0 is a residual, which no viewer shows by itself; add --merge"):
         lapgs_export(residuals, "--html")
-    with pytest.raises(UserInputError, match="--format does not go with --html"):
-        lapgs_export(residuals, "--html", "--format", "spz")
-    with pytest.raises(UserInputError, match="--scene needs --merge or --html"):
-        lapgs_export(residuals, "--scene", tmp_path)
+    refuses(UserInputError, "--format does not go with --html", lapgs_export, residuals, "--html", "--format", "spz")
+    refuses(UserInputError, "--scene needs --merge or --html", lapgs_export, residuals, "--scene", tmp_path)
     assert not (residuals / "export").exists()
 
 

@@ -30,6 +30,7 @@ from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_scene
 from tests.folders import files_in
+from tests.refusals import refuses
 from tests.training_scene import blob_field
 
 app = typer.Typer()
@@ -236,9 +237,7 @@ def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
 )
 def test_options_are_read_and_never_executed(foreign: Foreign, text: str, message: str) -> None:
     (foreign.folder / "cfg_args").write_text(text.replace("HERE", str(foreign.folder / "executed")))
-    with pytest.raises(RunFolderError, match=message) as caught:
-        lapgs("import-run", foreign.folder)
-    assert "\n" not in str(caught.value)
+    refuses(RunFolderError, message, lapgs, "import-run", foreign.folder)
     assert not (foreign.folder / "executed").exists()
 
 
@@ -281,8 +280,7 @@ def test_what_cannot_be_rendered_as_it_was_is_refused(foreign: Foreign, tmp_path
 def test_a_scene_that_moved_and_a_folder_that_is_taken(foreign: Foreign, scene: Path) -> None:
     foreign.field("", 30, blob_field())
     foreign.options(source_path="/not/there/any/more")
-    with pytest.raises(RunFolderError, match="say where it is now with -s"):
-        lapgs("import-run", foreign.folder, "--backbone", "fastgs")
+    refuses(RunFolderError, "say where it is now with -s", lapgs, "import-run", foreign.folder, "--backbone", "fastgs")
     lapgs("import-run", foreign.folder, "--backbone", "fastgs", "-s", scene)
     with pytest.raises(RunFolderError, match="already holds a run"):
         lapgs("import-run", foreign.folder, "--backbone", "fastgs", "-s", scene)

@@ -13,6 +13,7 @@ from lapgs_plugin.cli.app import INSTALLED, app
 from lapgs_plugin.cli.help_texts import module_summary
 from lapgs_plugin.errors import UserInputError
 from tests.plugin_package import install_package
+from tests.refusals import refuses
 
 ENTRIES = """\
 [lapgs.commands]
@@ -69,10 +70,8 @@ def test_a_command_is_called_by_its_name() -> None:
     assert "Say hello, and no more." in shown, "paragraphs flow"
     assert "completion" not in shown
     assert "Told here." in lapgs("told", "--help")
-    with pytest.raises(UserInputError, match="NAME 1: expected letters"):
-        lapgs("greet", "1")
-    with pytest.raises(UserInputError, match="no such option: --loud"):
-        lapgs("greet", "Ada", "--loud")
+    refuses(UserInputError, "NAME 1: expected letters", lapgs, "greet", "1")
+    refuses(UserInputError, "no such option: --loud", lapgs, "greet", "Ada", "--loud")
 
 
 def test_names_of_this_package_cannot_be_taken() -> None:

@@ -18,6 +18,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.training import backend
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
+from tests.refusals import refuses
 
 WORDS = "word " * 40 + "end"
 
@@ -95,8 +96,7 @@ def test_messages_name_folders_as_they_were_typed(
     for folder in ("empty", "full"):
         Path(folder).mkdir()
     Path("full/train.py").write_text("import json\n")
-    with pytest.raises(UserInputError, match=f"^{message}"):
-        succeeding(app, 120)(*words.split())
+    refuses(UserInputError, f"^{message}", succeeding(app, 120), *words.split())
 
 
 ODD = "r\x1b]0;title\n\x07\udcff[b]"

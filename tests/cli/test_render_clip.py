@@ -22,6 +22,7 @@ from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 from tests.folders import files_in
+from tests.refusals import refuses
 
 app = typer.Typer()
 app.command("render")(render)
@@ -131,8 +132,7 @@ def test_frames_through_the_cameras_of_a_file(run: Path, path_file: Path, tmp_pa
     ],
 )
 def test_mistakes_are_one_line(run: Path, arguments: tuple[object, ...], message: str) -> None:
-    with pytest.raises(UserInputError, match=message):
-        lapgs_render(run, *arguments)
+    refuses(UserInputError, message, lapgs_render, run, *arguments)
 
 
 def test_without_ffmpeg_it_names_the_extra(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,5 +144,4 @@ def test_without_ffmpeg_it_names_the_extra(run: Path, tmp_path: Path, monkeypatc
 def test_a_place_that_cannot_be_written(run: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for out in (("--out", tmp_path / "file"), ("--trajectory", "orbit", "--out", tmp_path / "file" / "clip.mp4")):
-        with pytest.raises(UserInputError, match=r"--out .*file is a file; expected a folder"):
-            lapgs_render(run, *out)
+        refuses(UserInputError, r"--out .*file is a file; expected a folder", lapgs_render, run, *out)

@@ -27,6 +27,7 @@ from lapgs_plugin.scenes.images import read_image
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, write_run, write_scene
 from tests.folders import files_in
+from tests.refusals import refuses
 
 app = typer.Typer()
 app.command("render")(render)
@@ -100,13 +101,10 @@ def test_an_interrupted_run_renders_what_is_there_and_is_not_measured(scene: Pat
     run = write_run(tmp_path / "run", scene, finished=1)
     lapgs("render", run)
     assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
-    with pytest.raises(UserInputError, match="level 0 cannot be rendered, expected 1; finer"):
-        lapgs("render", run, "--level", 0)
-    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
-        lapgs("eval", run)
+    refuses(UserInputError, "level 0 cannot be rendered, expected 1; finer", lapgs, "render", run, "--level", 0)
+    refuses(RunFolderError, "only 1 of 2 levels are trained", lapgs, "eval", run)
     empty = write_run(tmp_path / "empty", scene, finished=0)
-    with pytest.raises(RunFolderError, match="level 1 is not in this run"):
-        lapgs("render", empty)
+    refuses(RunFolderError, "level 1 is not in this run", lapgs, "render", empty)
 
 
 def test_view_names_that_would_share_a_file_keep_their_extension(tmp_path: Path) -> None:
@@ -187,8 +185,7 @@ def test_lpips_is_measured_where_there_are_weights_and_said_where_not(
     assert metrics["lpips_alex"] == pytest.approx(np.mean([view["lpips_alex"] for view in metrics["views"]]))
     assert metrics["lpips_alex"] > 0
     assert "LPIPS (AlexNet)" in output
-    with pytest.raises(UserInputError, match="--lpips magic: expected none, or some of vgg"):
-        lapgs("eval", run, "--lpips", "magic")
+    refuses(UserInputError, "--lpips magic: expected none, or some of vgg", lapgs, "eval", run, "--lpips", "magic")
 
 
 def test_without_held_out_views_eval_says_so(scene: Path, tmp_path: Path) -> None:
@@ -196,8 +193,7 @@ def test_without_held_out_views_eval_says_so(scene: Path, tmp_path: Path) -> Non
     assert "TRAINING" in lapgs("eval", run)
     metrics = json.loads((run / "metrics.json").read_text())
     assert (metrics["split"], metrics["num_views"]) == ("train", 10)
-    with pytest.raises(UserInputError, match="nothing was held out"):
-        lapgs("render", run, "--views", "test")
+    refuses(UserInputError, "nothing was held out", lapgs, "render", run, "--views", "test")
 
 
 def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> None:
@@ -209,10 +205,8 @@ def test_a_scene_that_moved_is_given_by_option(scene: Path, tmp_path: Path) -> N
         with pytest.raises(RunFolderError, match="old, which is not there any more; say where it is now with --scene"):
             lapgs(command, run)
         lapgs(command, run, "--scene", tmp_path / "new")
-        with pytest.raises(SceneError, match="no such scene folder"):
-            lapgs(command, run, "--scene", tmp_path / "nowhere")
-        with pytest.raises(SceneError, match=r"^--scene: .*neither a COLMAP"):
-            lapgs(command, run, "--scene", tmp_path)
+        refuses(SceneError, "no such scene folder", lapgs, command, run, "--scene", tmp_path / "nowhere")
+        refuses(SceneError, r"^--scene: .*neither a COLMAP", lapgs, command, run, "--scene", tmp_path)
 
 
 @pytest.mark.parametrize("hold_out", [False, True])
@@ -238,14 +232,12 @@ def test_another_scene_is_refused(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["render", "eval"])
 def test_a_folder_that_is_no_run_is_refused(command: str, tmp_path: Path) -> None:
-    with pytest.raises(RunFolderError, match="not a run"):
-        lapgs(command, tmp_path)
+    refuses(RunFolderError, "not a run", lapgs, command, tmp_path)
 
 
 @pytest.mark.parametrize(("option", "value"), [("--views", "validation"), ("--format", "tga")])
 def test_unknown_choices_name_the_known_ones(option: str, value: str, run: Path) -> None:
-    with pytest.raises(UserInputError, match=f"{option} {value}: expected "):
-        lapgs("render", run, option, value)
+    refuses(UserInputError, f"{option} {value}: expected ", lapgs, "render", run, option, value)
 
 
 def test_an_interruption_leaves_only_whole_images(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,9 +272,8 @@ def test_what_is_left_of_a_damaged_run_can_be_rendered(run: Path, damage: str) -
     lapgs("render", run, "--level", "1")
     assert files_in(run / "renders") == {"test/photos/00_base.png", "test/photos/08_base.png"}
     (run / "level_1" / "point_cloud.ply").unlink()
-    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing") as caught:
-        lapgs("render", run, "--level", "1")
-    assert "whole" not in str(caught.value)
+    line = refuses(RunFolderError, r"level 1 of .* is missing", lapgs, "render", run, "--level", "1")
+    assert "whole" not in line
 
 
 def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:

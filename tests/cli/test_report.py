@@ -23,6 +23,7 @@ from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.scenes import load_scene
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
+from tests.refusals import refuses
 from tests.training_scene import HEIGHT, WIDTH, blob_field
 
 app = typer.Typer()
@@ -298,10 +299,8 @@ def test_names_are_text_and_not_markup(tmp_path: Path) -> None:
 
 def test_an_unfinished_run_is_refused(run: Path, scene: Path, tmp_path: Path) -> None:
     unfinished = write_run(tmp_path / "unfinished", scene, finished=1)
-    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
-        lapgs_report(unfinished)
-    with pytest.raises(RunFolderError, match="only 1 of 2 levels are trained"):
-        lapgs_report(run, "--baseline", unfinished)
+    refuses(RunFolderError, "only 1 of 2 levels are trained", lapgs_report, unfinished)
+    refuses(RunFolderError, "only 1 of 2 levels are trained", lapgs_report, run, "--baseline", unfinished)
     assert not (run / "report.html").exists()
 
 

@@ -15,6 +15,7 @@ from lapgs_plugin.rendering.trajectory import trajectory_json
 from lapgs_plugin.runs.archive import RunArchive
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run
+from tests.refusals import refuses
 
 app = typer.Typer()
 app.command("eval")(evaluate)
@@ -50,19 +51,16 @@ def test_an_orbit_shows_flicker(scene: Path, tmp_path: Path) -> None:
 
 def test_contradicting_options_are_refused(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
-    with pytest.raises(UserInputError, match="--baseline needs --trajectory"):
-        lapgs_eval(run, "--baseline", run)
+    refuses(UserInputError, "--baseline needs --trajectory", lapgs_eval, run, "--baseline", run)
     with pytest.raises(UserInputError, match="--lpips does not go with --trajectory"):
         lapgs_eval(run, "--trajectory", "orbit", "--lpips", "vgg")
     with pytest.raises(UserInputError, match="has 2 levels, expected a single field"):
         lapgs_eval(run, "--trajectory", "orbit", "--frames", 3, "--baseline", run)
-    with pytest.raises(UserInputError, match="cannot be read"):
-        lapgs_eval(run, "--trajectory", tmp_path / "nowhere.json")
+    refuses(UserInputError, "cannot be read", lapgs_eval, run, "--trajectory", tmp_path / "nowhere.json")
     (tmp_path / "bad.json").write_text(
         '{"w": 8, "h": 8, "fl_x": 9, "frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}'
     )
-    with pytest.raises(UserInputError, match="frame 0 has no transform_matrix"):
-        lapgs_eval(run, "--trajectory", tmp_path / "bad.json")
+    refuses(UserInputError, "frame 0 has no transform_matrix", lapgs_eval, run, "--trajectory", tmp_path / "bad.json")
     with pytest.raises(RunFolderError, match="only 1 of 2 levels"):
         lapgs_eval(write_run(tmp_path / "half", scene, finished=1), "--trajectory", "orbit")
     assert not (run / "stability.json").exists()

@@ -19,6 +19,7 @@ from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.training import tensorboard
 from lapgs_plugin.untrusted import read_json_lines, read_toml
 from tests.cli.commands import succeeding
+from tests.refusals import refuses
 
 lapgs = succeeding(app, 120)
 SHORT = ("--iterations", 8, "--sh-degree", 1, "--rasterizer", "cpu")
@@ -82,8 +83,7 @@ def test_a_run_on_large_photos_has_a_longer_base(
 def test_the_file_of_an_extended_run_says_its_iterations(scene: Path, tmp_path: Path) -> None:
     run, words = tmp_path / "run", ("train", scene, "-o", tmp_path / "run", "--resume", "--iterations")
     lapgs("train", scene, "-o", run, "--levels", 1, *SHORT)
-    with pytest.raises(UserInputError, match=r"--iterations 7: the run in .* is finished with 8; give more"):
-        lapgs(*words, 7)
+    refuses(UserInputError, r"--iterations 7: the run in .* is finished with 8; give more", lapgs, *words, 7)
     (run / "preview.jpg").unlink()  # as if it was killed after its last iteration
     lapgs(*words, 8)
     assert (run / "preview.jpg").exists()
@@ -100,8 +100,7 @@ def test_a_settings_file_that_is_no_text_is_refused_before_a_run_is_extended(sce
     (run / "run.toml").write_bytes(b"iterations = 8\n#\xff\n")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     extend = ("train", scene, "-o", run, "--resume", "--iterations", 11)
-    with pytest.raises(RunFolderError, match=r"run\.toml is not readable: byte 16 .* expected UTF-8 .* delete it"):
-        lapgs(*extend)
+    refuses(RunFolderError, r"run\.toml is not readable: byte 16 .* expected UTF-8 .* delete it", lapgs, *extend)
     assert {path: path.read_bytes() for path in before} == before
     (run / "run.toml").unlink()  # as the message advises
     lapgs(*extend)
@@ -117,8 +116,7 @@ def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path
         (("--strategy", "mcmc"), "--strategy asks for mcmc, but the run in .* was started with 3dgs"),
         (("--cap-max", 50), "--cap-max is no option of --strategy 3dgs, with which the run in .* was started"),
     ):
-        with pytest.raises(UserInputError, match=message):
-            lapgs("train", scene, "-o", run, "--resume", *asked)
+        refuses(UserInputError, message, lapgs, "train", scene, "-o", run, "--resume", *asked)
 
 
 @pytest.mark.parametrize(
@@ -141,8 +139,7 @@ def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path
 def test_a_mistake_in_the_file_is_one_line(scene: Path, tmp_path: Path, text: str, message: str) -> None:
     config = tmp_path / "mine.toml"
     config.write_text(text)
-    with pytest.raises(UserInputError, match=f"^{config}.*{message}"):
-        lapgs("train", scene, "--config", config, "-o", tmp_path / "run")
+    refuses(UserInputError, f"^{config}.*{message}", lapgs, "train", scene, "--config", config, "-o", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -150,8 +147,7 @@ def test_the_file_of_a_scene_is_named_whatever_the_scene(tmp_path: Path) -> None
     config = tmp_path / "mine.toml"
     for scene in (r'"a\u001b[31m\nb"', r'"a\u0000b"', "3"):
         config.write_bytes(b"\xef\xbb\xbf" + f"scene = {scene}\n".encode())  # with the mark of Windows' editors
-        with pytest.raises(UserInputError, match=f"^{config}: "):
-            lapgs("train", "--config", config, "-o", tmp_path / "run")
+        refuses(UserInputError, f"^{config}: ", lapgs, "train", "--config", config, "-o", tmp_path / "run")
 
 
 def test_only_values_of_the_file_are_said_to_be_of_it(scene: Path, tmp_path: Path) -> None:
@@ -162,8 +158,7 @@ def test_only_values_of_the_file_are_said_to_be_of_it(scene: Path, tmp_path: Pat
         (["--joint", 0.5], f"{config}: gone: no such scene"),
         ([scene, "--split", "1/2", "--joint", 0.5], "--split has 1 shares"),
     ):
-        with pytest.raises(UserInputError, match=f"^{message}"):
-            lapgs("train", *words, "--config", config, "-o", tmp_path / "run")
+        refuses(UserInputError, f"^{message}", lapgs, "train", *words, "--config", config, "-o", tmp_path / "run")
 
 
 def test_a_file_that_is_not_there(scene: Path, tmp_path: Path) -> None:
@@ -197,8 +192,7 @@ def test_tensorboard_has_the_figures_of_the_history(scene: Path, tmp_path: Path)
 
 def test_without_tensorboard_nothing_is_written(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "torch.utils.tensorboard.writer", None)
-    with pytest.raises(UserInputError, match="is not installed"):
-        tensorboard.require_tensorboard()
+    refuses(UserInputError, "is not installed", tensorboard.require_tensorboard)
     with pytest.raises(UserInputError, match="is not installed"):
         lapgs("train", scene, "-o", tmp_path / "run", "--log", "tensorboard", *SHORT)
     with pytest.raises(UserInputError, match="expected tensorboard"):

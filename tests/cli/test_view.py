@@ -16,6 +16,7 @@ from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
+from tests.refusals import refuses
 from tests.viewer.pages import statuses
 
 viser = pytest.importorskip("viser", reason="needs the extra 'viewer'")
@@ -55,8 +56,7 @@ def test_a_run_without_its_scene_is_shown_without_cameras(tmp_path: Path) -> Non
     run = write_run(tmp_path / "run", scene)
     shutil.rmtree(scene)
     assert "without the scene's cameras" in lapgs_view(run)
-    with pytest.raises(LapgsError, match="no such scene folder"):
-        lapgs_view(run, "--scene", tmp_path / "nowhere")
+    refuses(LapgsError, "no such scene folder", lapgs_view, run, "--scene", tmp_path / "nowhere")
 
 
 def test_a_missing_or_truncated_level_is_said_and_the_coarser_ones_are_shown(scene: Path, tmp_path: Path) -> None:
@@ -68,8 +68,7 @@ def test_a_missing_or_truncated_level_is_said_and_the_coarser_ones_are_shown(sce
     ply.unlink()
     assert re.search(r"level 0 of .* is missing: .*; showing level 1 of 2", lapgs_view(run))
     (run / "level_1" / "point_cloud.ply").unlink()
-    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
-        lapgs_view(run)
+    refuses(RunFolderError, r"level 1 of .* is missing", lapgs_view, run)
 
 
 def test_a_foreign_page_may_not_look(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,13 +90,11 @@ def test_an_address_of_another_machine_is_refused(scene: Path, tmp_path: Path) -
 
 def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"lapgs_plugin\[viewer\]"):
-        lapgs_view(tmp_path)
+    refuses(MissingExtraError, r"lapgs_plugin\[viewer\]", lapgs_view, tmp_path)
 
 
 def test_a_folder_that_is_no_run_is_refused_before_anything_is_served(tmp_path: Path) -> None:
-    with pytest.raises(RunFolderError, match=r"nowhere does not exist, so it is not a run"):
-        lapgs_view(tmp_path / "nowhere")
+    refuses(RunFolderError, r"nowhere does not exist, so it is not a run", lapgs_view, tmp_path / "nowhere")
 
 
 def test_the_page_is_served_without_torch() -> None:

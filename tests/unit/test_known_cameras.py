@@ -25,6 +25,7 @@ from lapgs_plugin.scenes.prepare import pipeline
 from lapgs_plugin.scenes.prepare.pipeline import PrepareResult, prepare_scene
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from tests.folders import snapshot
+from tests.refusals import refuses
 
 Array = NDArray[np.float64]
 
@@ -187,8 +188,7 @@ def test_images_are_what_pinhole_cameras_see(tmp_path: Path, caplog: pytest.LogC
 )
 def test_models_are_found_where_programs_leave_them(tmp_path: Path, place: str, photos: str) -> None:
     scene = _scene(tmp_path / "scene", place, photos, tracks=False)
-    with pytest.raises(SceneError, match=rf"`lapgs prepare {scene} OUT`"):
-        load_scene(scene, images=photos, progress=False)
+    refuses(SceneError, rf"`lapgs prepare {scene} OUT`", load_scene, scene, images=photos, progress=False)
     assert _run(scene, tmp_path / "out").left_out == ()
     model = _check_images(tmp_path / "out", 0.01)
     assert model.compute_num_observations() == 0
@@ -377,9 +377,7 @@ def test_a_transforms_file_gives_the_images_and_poses_of_the_model(tmp_path: Pat
     ],
 )
 def test_lenses_that_are_not_understood_are_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(SceneError, match=message) as caught:
-        _run(_transforms(tmp_path / "scene", **changes), tmp_path / "out")
-    assert "\n" not in str(caught.value)
+    refuses(SceneError, message, _run, _transforms(tmp_path / "scene", **changes), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -472,13 +470,11 @@ def test_an_interrupted_call_is_repeated(tmp_path: Path, monkeypatch: pytest.Mon
         with pytest.raises(KeyboardInterrupt):
             _run(scene, tmp_path / "out")
     assert [entry.name for entry in (tmp_path / "out").iterdir()] == [".prepare"]
-    with pytest.raises(UserInputError, match="unfinished work with other --max-size"):
-        _run(scene, tmp_path / "out", max_size=100)
+    refuses(UserInputError, "unfinished work with other --max-size", _run, scene, tmp_path / "out", max_size=100)
     _run(scene, tmp_path / "out")
     _run(scene, tmp_path / "other")
     assert snapshot(tmp_path / "out") == snapshot(tmp_path / "other")
-    with pytest.raises(LapgsError, match="already holds a scene"):
-        _run(scene, tmp_path / "out")
+    refuses(LapgsError, "already holds a scene", _run, scene, tmp_path / "out")
 
 
 def test_the_command_that_a_refused_scene_is_given_makes_one(tmp_path: Path) -> None:

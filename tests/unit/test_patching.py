@@ -32,6 +32,7 @@ from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 from tests.contract.stub_runs import CHECKOUTS
 from tests.folders import snapshot
+from tests.refusals import refuses
 
 # An anchor is written between [name and name], so that its index among the tokens is known.
 PROGRAMS = {
@@ -235,8 +236,7 @@ def test_a_tree_without_any_one_anchor_is_refused_and_untouched(root: Path, data
     lost = data.draw(st.sampled_from(span))
     broken = data.draw(trees({**PARSED, file: Program(tokens[:lost] + tokens[lost + 1 :], {})}))
     target = write_tree(root, broken)
-    with pytest.raises(PatchError, match=rf"{file}:\d+: expected `.*` once .*but found it nowhere"):
-        plan_apply(target, [ALL_SETS])
+    refuses(PatchError, rf"{file}:\d+: expected `.*` once .*but found it nowhere", plan_apply, target, [ALL_SETS])
     assert snapshot(root) == broken
     assert {name for name, state in states(target).items() if state is State.IMPOSSIBLE} == {
         EDITS[name].set if name in EDITS else CHECK.set
@@ -251,8 +251,7 @@ def test_an_anchor_that_stands_twice_is_refused(root: Path, name: str) -> None:
     tokens = [*program.tokens[: span.stop], ";", *program.tokens[span.start :]]
     target = write_tree(root, {other: lay_out(p.tokens, plain()) for other, p in PARSED.items()})
     (root / file).write_bytes(lay_out(tokens, plain()))
-    with pytest.raises(PatchError, match="but found it twice"):
-        plan_apply(target, [ALL_SETS])
+    refuses(PatchError, "but found it twice", plan_apply, target, [ALL_SETS])
 
 
 @pytest.fixture
@@ -272,9 +271,7 @@ def test_a_message_names_the_place_what_was_expected_and_that_nothing_happened(t
     facts = (
         rf"shade\.cu:{line}: .*`result \+= 0\.5f;` once in shade .*signed/raw.*nothing was changed.*lapgs help patches"
     )
-    with pytest.raises(PatchError, match=facts) as caught:
-        plan_apply(target, ["signed"])
-    assert "\n" not in str(caught.value)
+    refuses(PatchError, facts, plan_apply, target, ["signed"])
 
 
 def test_a_function_defined_twice_or_never_is_refused(target: Target) -> None:
@@ -283,11 +280,9 @@ def test_a_function_defined_twice_or_never_is_refused(target: Target) -> None:
     never = source.replace(b"shade\n(\nint\ni", b"tone\n(\nint\ni")
     for changed, count in ((source + b"float shade(int a) { return a; }", 2), (never, 0)):
         path.write_bytes(changed)
-        with pytest.raises(PatchError, match=f"one definition of shade, found {count}"):
-            plan_apply(target, ["signed"])
+        refuses(PatchError, f"one definition of shade, found {count}", plan_apply, target, ["signed"])
     path.unlink()
-    with pytest.raises(PatchError, match=r"kernels/shade\.cu: expected this file"):
-        plan_apply(target, ["signed"])
+    refuses(PatchError, r"kernels/shade\.cu: expected this file", plan_apply, target, ["signed"])
 
 
 def test_what_looks_like_code_in_strings_comments_and_macros_is_not_code(target: Target) -> None:
@@ -357,8 +352,7 @@ def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
     head, tail = path.read_bytes().rsplit(marker, 1)
     path.write_bytes(head + tail)
     for plan in (plan_apply, plan_revert):
-        with pytest.raises(PatchError, match="half a lapgs block"):
-            plan(target, [ALL_SETS])
+        refuses(PatchError, "half a lapgs block", plan, target, [ALL_SETS])
 
 
 def test_states(target: Target) -> None:
@@ -395,8 +389,7 @@ def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, by
     renewed = apply(target, "signed")
     assert renewed == apply(write_tree(target.folder, tree), "signed")
     newer = replace(RECIPE, edit=(EDITS["guard"],))
-    with pytest.raises(PatchError, match="signed is not among its sets of edits"):
-        plan_apply(Target(newer, target.folder), ["build"])
+    refuses(PatchError, "signed is not among its sets of edits", plan_apply, Target(newer, target.folder), ["build"])
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -428,8 +421,7 @@ def test_a_write_that_fails_leaves_every_file_as_it_was(
 def test_a_file_changed_meanwhile_is_not_overwritten(target: Target, tree: dict[str, bytes]) -> None:
     changes = plan_apply(target, [ALL_SETS])
     (target.folder / HOST).write_bytes(b"new")
-    with pytest.raises(PatchError, match="changed by another program"):
-        write_all(changes)
+    refuses(PatchError, "changed by another program", write_all, changes)
     assert snapshot(target.folder) == {**tree, HOST: b"new"}
 
 
@@ -859,10 +851,8 @@ def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, dep
 
 
 def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(PatchError, match=r"known: .*graphdeco.*are its submodules checked out\?"):
-        find_targets(tmp_path)
-    with pytest.raises(PatchError, match="no such folder"):
-        find_targets(tmp_path / "missing")
+    refuses(PatchError, r"known: .*graphdeco.*are its submodules checked out\?", find_targets, tmp_path)
+    refuses(PatchError, "no such folder", find_targets, tmp_path / "missing")
 
 
 HEAD = 'name = "new"\ntitle = "New"\npresent = []\n'
@@ -888,8 +878,7 @@ EDIT = HEAD + '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\n'
 )
 def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "new.toml").write_text(text)
-    with pytest.raises(PatchError, match=rf"new\.toml.*{re.escape(message)}"):
-        load_recipes(tmp_path)
+    refuses(PatchError, rf"new\.toml.*{re.escape(message)}", load_recipes, tmp_path)
 
 
 def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> None:
@@ -965,8 +954,7 @@ def test_the_command_refuses_before_it_writes(rasterizer: Path) -> None:
     assert f"uncommitted changes: {path}" in lapgs_patch("status", rasterizer)
     path.chmod(0o444)
     for command in ("apply", "apply --allow-dirty"):
-        with pytest.raises(PatchError, match=rf"read-only: {re.escape(str(path))}"):
-            lapgs_patch(*command.split(), rasterizer)
+        refuses(PatchError, rf"read-only: {re.escape(str(path))}", lapgs_patch, *command.split(), rasterizer)
     assert f"read-only: {path}" in lapgs_patch("status", rasterizer)
     assert snapshot(rasterizer / "cuda_rasterizer") == before
     path.chmod(0o644)

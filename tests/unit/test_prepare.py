@@ -36,6 +36,7 @@ from lapgs_plugin.scenes.sample.raycast import render
 from lapgs_plugin.scenes.sample.solids import ball, box, rod
 from lapgs_plugin.scenes.sample.world import PALETTE
 from tests.folders import snapshot
+from tests.refusals import refuses
 
 SIZE, WIDE = (288, 192), (336, 228)
 """Of the photos, and of images that hold all that a bent lens sees."""
@@ -373,8 +374,7 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
 def test_folders_inside_each_other_are_refused(noise: Path) -> None:
     before = snapshot(noise.parent)
     for photos, out in ((noise, noise / "scene"), (noise, noise.parent), (noise, noise)):
-        with pytest.raises(UserInputError, match="lies in the other"):
-            prepare_scene(photos, out, overwrite=True, progress=False)
+        refuses(UserInputError, "lies in the other", prepare_scene, photos, out, overwrite=True, progress=False)
     assert snapshot(noise.parent) == before
 
 
@@ -383,8 +383,7 @@ def test_a_full_disk_is_one_line(few: Path, tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # no file may grow beyond
     try:
-        with pytest.raises(LapgsError, match="check free space"):
-            prepare_scene(few, tmp_path / "scene", progress=False)
+        refuses(LapgsError, "check free space", prepare_scene, few, tmp_path / "scene", progress=False)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 

@@ -18,6 +18,7 @@ from lapgs_plugin.hierarchy.settings import HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS, Reconstructed, Supervision
 from lapgs_plugin.registry import Registry
 from tests.plugin_package import install_package
+from tests.refusals import refuses
 
 ENTRIES = """\
 [lapgs_plugin.supervisions]
@@ -81,8 +82,7 @@ def test_entries_that_are_no_adapter_are_one_line(name: str, received: str) -> N
 def test_an_adapter_without_info_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = "from lapgs_plugin.adapters.base import BackboneAdapter\nclass Bare(BackboneAdapter): pass\n"
     install_package(tmp_path, monkeypatch, "tiny_fork", "[lapgs_plugin.backbones]\nbare = tiny_fork:Bare\n", source)
-    with pytest.raises(UserInputError, match=r"--backbone bare: tiny_fork.Bare has no BackboneInfo called info; fix"):
-        all_adapters()
+    refuses(UserInputError, r"--backbone bare: tiny_fork.Bare has no BackboneInfo called info; fix", all_adapters)
 
 
 def test_own_entries_may_be_instances_or_be_loaded_when_they_are_looked_up() -> None:

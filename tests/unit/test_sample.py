@@ -25,6 +25,7 @@ from lapgs_plugin.scenes.sample.scene import orbit_camera
 from lapgs_plugin.scenes.sample.solids import Solid, ball, box, rod
 from lapgs_plugin.scenes.sample.world import build_world
 from tests.folders import snapshot
+from tests.refusals import refuses
 
 SMALL = {"width": 48, "height": 32, "views": 3, "points": 40, "progress": False}
 WIDTH, HEIGHT = 240, 160
@@ -331,8 +332,7 @@ def test_blocks_of_an_image_miss_no_solid() -> None:
     ],
 )
 def test_arguments_out_of_range_are_refused(tmp_path: Path, change: dict[str, int], message: str) -> None:
-    with pytest.raises(UserInputError, match=message):
-        make_sample_scene(tmp_path / "scene", **{**SMALL, **change})
+    refuses(UserInputError, message, make_sample_scene, tmp_path / "scene", **{**SMALL, **change})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -340,18 +340,15 @@ def test_a_folder_with_anything_in_it_is_refused(tmp_path: Path) -> None:
     scene, file = tmp_path / "scene", tmp_path / "file"
     make_sample_scene(scene, **SMALL)
     before = snapshot(scene)
-    with pytest.raises(UserInputError, match="--overwrite"):
-        make_sample_scene(scene, **SMALL, seed=1)
+    refuses(UserInputError, "--overwrite", make_sample_scene, scene, **SMALL, seed=1)
     assert snapshot(scene) == before
     make_sample_scene(scene, **SMALL, seed=1, overwrite=True)
     assert snapshot(scene) != before
     (scene / "thesis.txt").write_text("years of work")
-    with pytest.raises(UserInputError, match="holds thesis"):
-        make_sample_scene(scene, **SMALL, overwrite=True)
+    refuses(UserInputError, "holds thesis", make_sample_scene, scene, **SMALL, overwrite=True)
     assert (scene / "thesis.txt").exists()
     file.write_text("")
-    with pytest.raises(UserInputError, match="a file, expected a folder"):
-        make_sample_scene(file, **SMALL, overwrite=True)
+    refuses(UserInputError, "a file, expected a folder", make_sample_scene, file, **SMALL, overwrite=True)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "scene"]
 
 
@@ -383,8 +380,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))  # no file may grow beyond
     try:
-        with pytest.raises(LapgsError, match="check free space"):
-            make_sample_scene(tmp_path / "scene", **SMALL)
+        refuses(LapgsError, "check free space", make_sample_scene, tmp_path / "scene", **SMALL)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []

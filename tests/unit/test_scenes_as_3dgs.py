@@ -14,6 +14,7 @@ from PIL import Image
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.scenes.images import image_size, read_as_3dgs, read_image
 from lapgs_plugin.scenes.resolution import parse_resolution
+from tests.refusals import refuses
 from tests.unit.test_scenes_colmap import Model, load, make_scene
 
 WHITE = (1.0, 1.0, 1.0)
@@ -44,8 +45,7 @@ def test_the_float_factor_can_lose_a_pixel() -> None:
 
 @pytest.mark.parametrize("text", ["3dgs:", "3dgs:0", "3dgs:-2", "3dgs:1/2", "3dgs:1k", "3dgs:2.5"])
 def test_what_is_no_option_of_theirs_is_refused(text: str) -> None:
-    with pytest.raises(UserInputError, match=r"expected -1, 1, 2, 4, 8 or a width in pixels after 3dgs:"):
-        parse_resolution(text)
+    refuses(UserInputError, r"expected -1, 1, 2, 4, 8 or a width in pixels after 3dgs:", parse_resolution, text)
 
 
 @pytest.fixture
@@ -104,10 +104,8 @@ def test_damaged_and_missing_images_are_named(tmp_path: Path, photo: Image.Image
     path = tmp_path / "photo.png"
     photo.save(path)
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(SceneError, match=r"photo\.png: Pillow, with which .* cannot read it"):
-        read_as_3dgs(path, (61, 43), None)
-    with pytest.raises(SceneError, match=r"none\.png: no such image"):
-        read_as_3dgs(tmp_path / "none.png", (61, 43), None)
+    refuses(SceneError, r"photo\.png: Pillow, with which .* cannot read it", read_as_3dgs, path, (61, 43), None)
+    refuses(SceneError, r"none\.png: no such image", read_as_3dgs, tmp_path / "none.png", (61, 43), None)
 
 
 def test_cameras_look_through_the_middle_of_the_image(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
 from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image, resize_image, write_image
+from tests.refusals import refuses
 
 
 def noise(*shape: int) -> NDArray[np.float32]:
@@ -271,23 +272,20 @@ def test_channels_without_a_colour_are_refused(tmp_path: Path) -> None:
     assert target.open(str(tmp_path / "a.exr"), spec)
     assert target.write_image(np.ones((3, 4, 1), np.float32))
     assert target.close()
-    with pytest.raises(SceneError, match=r"a\.exr: the image has no colours, expected grey or RGB"):
-        read_image(tmp_path / "a.exr")
+    refuses(SceneError, r"a\.exr: the image has no colours, expected grey or RGB", read_image, tmp_path / "a.exr")
 
 
 def test_names_that_no_file_can_have(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"image a{32}\.\.\. has 304 bytes, expected at most 255"):
         read_image(tmp_path / ("a" * 300 + ".png"))
     for name in ("a\0b.png", "\ud800.png"):
-        with pytest.raises(SceneError, match="no such image"):
-            read_image(tmp_path / name)
+        refuses(SceneError, "no such image", read_image, tmp_path / name)
 
 
 def test_a_name_that_is_no_utf_8(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"t\xfcr.png")
     path.write_bytes(b"")
-    with pytest.raises(SceneError, match=r"t\\udcfcr\.png: its name is not UTF-8; rename it"):
-        read_image(path)
+    refuses(SceneError, r"t\\udcfcr\.png: its name is not UTF-8; rename it", read_image, path)
 
 
 # Files that are no images
@@ -309,9 +307,7 @@ def damaged(path: Path, how: str) -> None:
 def test_damaged_file_is_named(tmp_path: Path, suffix: str, how: str) -> None:
     path = tmp_path / f"broken{suffix}"
     damaged(path, how)
-    with pytest.raises(SceneError, match=f"broken{suffix}") as caught:
-        read_image(path)
-    assert "\n" not in str(caught.value)
+    refuses(SceneError, f"broken{suffix}", read_image, path)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".exr"])
@@ -334,8 +330,7 @@ def test_progressive_jpeg_cut_short(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), (noise(60, 80, 3) * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
     path.write_bytes(path.read_bytes()[:-400])
-    with pytest.raises(SceneError, match=r"a\.jpg: the image is damaged or cut short"):
-        read_image(path)
+    refuses(SceneError, r"a\.jpg: the image is damaged or cut short", read_image, path)
 
 
 def jpeg(**options: object) -> bytes:
@@ -378,8 +373,7 @@ def test_bytes_between_the_parts_of_a_jpeg(
     assert not caplog.records
     for share in (0.3, 0.6, 0.95):
         path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(SceneError, match=r"a\.jpg: (the image is damaged or cut short|not a readable image)"):
-            read_image(path)
+        refuses(SceneError, r"a\.jpg: (the image is damaged or cut short|not a readable image)", read_image, path)
 
 
 def test_a_jpeg_that_ends_early_or_holds_wrong_bits(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -387,8 +381,7 @@ def test_a_jpeg_that_ends_early_or_holds_wrong_bits(tmp_path: Path, caplog: pyte
     first, second = (marker.start() for marker in list(re.finditer(rb"\xff[\xd0-\xd7]", content))[:2])
     for end in (first, first - 20, second + 30):
         path.write_bytes(content[:end] + b"\xff\xd9")
-        with pytest.raises(SceneError, match=r"a\.jpg: the image is damaged or cut short"):
-            read_image(path)
+        refuses(SceneError, r"a\.jpg: the image is damaged or cut short", read_image, path)
     path.write_bytes(content[:first] + content[second:])  # every decoder shows most of it
     for _ in range(2):
         assert read_image(path).shape == (3, 60, 80)
@@ -418,8 +411,7 @@ def test_a_damaged_png_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[
     cut = [content[: int(len(content) * share)] for share in (0.0006, 0.001, 0.0015, 0.01, 0.5, 0.99)]
     for spoilt in (*flipped, *cut, content[:8] + b"".join(others), content[:8] + header + others[-1]):
         path.write_bytes(spoilt)
-        with pytest.raises(SceneError, match=r"a\.png: (the image is damaged or cut short|not a readable image)"):
-            read_image(path)
+        refuses(SceneError, r"a\.png: (the image is damaged or cut short|not a readable image)", read_image, path)
     text = b"\0\0\0\3tEXta\0b????"
     for harmless in (content[:-12], content + b"more", content[:8] + header + text + b"".join(others)):
         path.write_bytes(harmless)
@@ -459,10 +451,7 @@ def test_sizes_that_no_photo_has_take_no_memory(tmp_path: Path, kind: str) -> No
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for read in (read_image, image_size, lambda file: read_as_3dgs(file, (8, 6), None)):
-        with pytest.raises(
-            SceneError, match=r"a\.\w+: (the image is 60000x60000 pixels|not a readable image .*claims)"
-        ):
-            read(path)
+        refuses(SceneError, r"a\.\w+: (the image is 60000x60000 pixels|not a readable image .*claims)", read, path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak < 300_000  # KiB; seen 6,200
 
 
@@ -474,13 +463,11 @@ def test_a_photo_that_is_no_file(tmp_path: Path) -> None:
         ("astray.png", "nowhere", "no such image: it is a link to nowhere, which is not there"),
     ):
         (tmp_path / name).symlink_to(aim)
-        with pytest.raises(SceneError, match=f"{name}:? {message}"):
-            read_image(tmp_path / name)
+        refuses(SceneError, f"{name}:? {message}", read_image, tmp_path / name)
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="no such image"):
-        read_image(tmp_path / "none.png")
+    refuses(SceneError, "no such image", read_image, tmp_path / "none.png")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -488,8 +475,7 @@ def test_nan_and_inf_are_refused(tmp_path: Path, value: float) -> None:
     pixels = noise(4, 5, 3)
     pixels[2, 3, 1] = value
     save(tmp_path / "a.exr", pixels, oiio.FLOAT)
-    with pytest.raises(SceneError, match=r"a\.exr: the image holds NaN or inf"):
-        read_image(tmp_path / "a.exr")
+    refuses(SceneError, r"a\.exr: the image holds NaN or inf", read_image, tmp_path / "a.exr")
 
 
 # Resizing
@@ -595,8 +581,7 @@ def test_jpeg_is_close(tmp_path: Path, suffix: str) -> None:
 
 def test_unknown_type_is_refused(tmp_path: Path) -> None:
     for name in ("a.gif", "a"):
-        with pytest.raises(UserInputError, match=r"expected \.png, \.jpg or \.exr"):
-            write_image(tmp_path / name, torch.zeros(3, 4, 4))
+        refuses(UserInputError, r"expected \.png, \.jpg or \.exr", write_image, tmp_path / name, torch.zeros(3, 4, 4))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -13,6 +13,7 @@ import pytest
 from lapgs_plugin import untrusted
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.untrusted import STRICT, read_json, read_json_lines, read_text, read_toml, shortened
+from tests.refusals import refuses
 
 MEMORY = 60 * 2**20
 """Bytes that a refused file of a megabyte may take; the worst took 31 MiB."""
@@ -125,8 +126,7 @@ def test_a_json_file_that_is_too_large_says_how_to_read_it(tmp_path: Path, monke
     monkeypatch.setenv("LAPGS_JSON_MIB", "2")
     assert len(read_json(path)) == 2**20
     monkeypatch.setenv("LAPGS_JSON_MIB", "much")
-    with pytest.raises(UserInputError, match="LAPGS_JSON_MIB='much': expected a number of MiB"):
-        read_json(path)
+    refuses(UserInputError, "LAPGS_JSON_MIB='much': expected a number of MiB", read_json, path)
 
 
 def test_what_is_right_comes_back(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ pytest.importorskip("viser", reason="needs the extra 'viewer'")
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.viewer import following
 from lapgs_plugin.viewer.following import FollowedRun, RunFollower
+from tests.refusals import refuses
 from tests.waiting import wait_for
 
 
@@ -172,5 +173,4 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
 def test_without_a_level_to_show_damage_is_an_error(scene: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", scene, finished=1)
     (folder / "level_1" / "point_cloud.ply").unlink()
-    with pytest.raises(RunFolderError, match=r"level 1 of .* is missing"):
-        FollowedRun(folder, RenderOptions(device="cpu"))
+    refuses(RunFolderError, r"level 1 of .* is missing", FollowedRun, folder, RenderOptions(device="cpu"))

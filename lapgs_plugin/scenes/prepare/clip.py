@@ -75,7 +75,7 @@ def judge(grey: NDArray[np.uint8]) -> Judged:
 
 
 def sharp_and_moving(judged: list[Judged], count: int) -> list[int]:
-    """Return the sharpest frame of each of `count` parts, without those that show what the one before showed."""
+    """Return the sharpest frame of each of `count` parts, without those that show the same view as the frame before."""
     picked: list[int] = []
     for part in np.array_split(np.arange(len(judged)), max(count, 1)):
         best = max(part.tolist(), key=lambda number: judged[number].sharpness, default=None)
@@ -117,7 +117,7 @@ def _frames(clip: Path, pixels: str, filters: str) -> Iterator[NDArray[np.uint8]
     import imageio_ffmpeg
 
     depth = "rgb24" if pixels == "ppm" else "gray"  # else phones' HDR videos of 10 bits become 16-bit images
-    chain = f"showinfo=checksum=0,{SQUARE},{filters}"  # the first of these tells the size of each frame
+    chain = f"showinfo=checksum=0,{SQUARE},{filters}"  # showinfo logs the size of each frame
     options = ["-map", "0:v:0", "-vf", chain, "-fps_mode", "passthrough", "-pix_fmt", depth]
     options += ["-f", "image2pipe", "-c:v", pixels, "-"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "info", "-nostats", "-nostdin", "-i", str(clip), *options]
@@ -165,7 +165,7 @@ def _length(clip: Path) -> tuple[int, float]:
 
 
 def _undecodable(clip: Path, text: str) -> SceneError:
-    """Return the error about a clip, with the line of FFmpeg's output that says why it failed."""
+    """Return the error about a clip, with the reason from FFmpeg's output."""
     lines = [line.strip() for line in text.splitlines() if line.strip(" =")]
     reason = next((line for line in reversed(lines) if "rror" in line or "nvalid" in line), "no reason given")
     return SceneError(

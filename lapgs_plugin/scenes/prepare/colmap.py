@@ -42,7 +42,7 @@ DEFAULT_MODEL = "OPENCV"
 """Camera model that "auto" fits first."""
 
 GLOBAL_STEPS = 5
-"""Steps that the global mapper says it runs."""
+"""Steps that the global mapper logs."""
 
 POLL_SECONDS = 0.2
 LOG = "colmap.log"
@@ -284,7 +284,7 @@ def _show_phase(worker: subprocess.Popen[bytes], phase: Phase, seen: ProgressCal
     while worker.poll() is None and (last or done < total):
         with suppress(subprocess.TimeoutExpired):
             worker.wait(POLL_SECONDS)
-        done = max(done, phase.done())  # a database that is busy tells nothing
+        done = max(done, phase.done())  # a busy database gives no count
         seen(min(done, total - 1), total)  # COLMAP works on after its last item
     if not worker.returncode:
         seen(total if phase.complete else min(max(done, phase.done()), total), total)

@@ -148,7 +148,7 @@ def convert_photo(source: Path, target: Path) -> None:
 
 
 def camera_of(photo: Path) -> tuple[str, ...]:
-    """Return maker, model and focal lengths by EXIF, empty where a photo does not tell."""
+    """Return maker, model and focal lengths by EXIF, empty where a photo has none."""
     with suppress(Exception), Image.open(photo) as opened:  # other software reads the photo; EXIF only helps
         exif = opened.getexif()
         inner, tags = exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base
@@ -159,7 +159,7 @@ def camera_of(photo: Path) -> tuple[str, ...]:
 
 
 def quarter_turns(photo: Path) -> int | None:
-    """Return the quarter turns clockwise that make a photo upright by EXIF; None where it does not tell, or mirrors."""
+    """Return the quarter turns clockwise that make a photo upright by EXIF; None without EXIF or if it is mirrored."""
     with suppress(Exception), Image.open(photo) as opened:  # as above
         return {1: 0, 6: 1, 3: 2, 8: 3}.get(opened.getexif().get(ExifTags.Base.Orientation, 0))
     return None

@@ -1,4 +1,4 @@
-"""Declare what a user can choose about a scene that is made from photos. Imports neither torch nor pycolmap."""
+"""Declare the options of a scene that is made from photos. Imports neither torch nor pycolmap."""
 
 from __future__ import annotations
 

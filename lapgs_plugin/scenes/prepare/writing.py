@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes.
 
-    All are turned upright as EXIF says of most, so that images of one camera keep one size.
+    All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size.
     """
     shutil.rmtree(job.scene, ignore_errors=True)
     model.tear_down()  # of cameras without photos

@@ -14,14 +14,14 @@ Floats = NDArray[np.float32]
 COLUMNS = 19
 """Numbers of a solid: half its sides (3), 1 / its semi-axes (3), rotation by rows (9), centre (3), 1 for a room."""
 
-# Float literals are doubles, and would turn all that they meet into doubles.
+# Constants, because float literals are doubles and promote results to doubles.
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _INF = np.float32(np.inf)
 
 
 @jit
 def nearest_hits(solids: Floats, origin: Floats, directions: Floats, distance: Floats, index: NDArray[Any]) -> None:
-    """Write what each ray hits first.
+    """Write the first solid that each ray hits, and its distance.
 
     Args:
         solids: (m, COLUMNS), see `Solid`.
