@@ -198,13 +198,8 @@ def _print_speeds(
         cameras = [camera.resized(*render_size(settings.size)) for camera in cameras]
     table = make_table("", "size", "Gaussians", "ms", "FPS")
     for speed in measure_speed(renderer, cameras, level):
-        table.add_row(
-            speed.what,
-            f"{speed.size[0]}x{speed.size[1]}",
-            f"{speed.gaussians:,}",
-            f"{speed.milliseconds:.2f}",
-            f"{speed.fps:.1f}",
-        )
+        size, times = f"{speed.size[0]}x{speed.size[1]}", (f"{speed.milliseconds:.2f}", f"{speed.fps:.1f}")
+        table.add_row(speed.what, size, f"{speed.gaussians:,}", *times)
     say(f"Frames a second, medians over {counted(len(cameras), 'camera')}")
     make_console().print(table)
 

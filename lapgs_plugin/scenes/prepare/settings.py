@@ -29,7 +29,9 @@ class PrepareSettings:
     max_size: int | None = option(
         None, "Longest side of the scene's images in pixels. Default: that of the photos.", least=MIN_SIDE
     )
-    frames: int | None = option(None, "Frames to pick from a video. Default: two a second, 40 to 240.", least=2)
+    frames: int | None = option(
+        None, "Frames to pick from a video. Default: 2 a second, clamped to [40, 240].", least=2
+    )
     masks: Path | None = option(
         None,
         "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
