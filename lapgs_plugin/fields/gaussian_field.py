@@ -174,13 +174,13 @@ def require_finite(trained: Mapping[int, GaussianField], level: int) -> None:
     Raises:
         FieldError: as of `GaussianField.require_finite`; names the level of another one.
     """
-    for each, field in trained.items():
+    for trained_level, field in trained.items():
         try:
             field.require_finite()
         except FieldError as error:
-            if each == level:
+            if trained_level == level:
                 raise
-            raise FieldError(f"{error} of level {each}, trained jointly") from error
+            raise FieldError(f"{error} of level {trained_level}, trained jointly") from error
 
 
 def field_from_splats(splats: Mapping[str, Tensor], signed: bool = False) -> GaussianField:

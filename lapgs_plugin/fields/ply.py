@@ -60,7 +60,7 @@ def _check_header(path: Path) -> None:
     if (end := _END.search(start)) is None:
         raise ValueError(f"it is not a PLY file (no end_header in its first {min(size, HEADER_BYTES):,} bytes)")
     header = start[: end.end()].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    counts = [found.group(4) for found in _ELEMENT.finditer(header)]
+    counts = [element.group(4) for element in _ELEMENT.finditer(header)]
     for count in counts:
         if not re.fullmatch(rb"[0-9]{1,15}", count):
             raise ValueError(f"its header counts {shortened(count.decode('latin-1'))}, expected a number from 0")

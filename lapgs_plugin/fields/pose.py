@@ -33,11 +33,11 @@ def corrected(camera: Camera, correction: Sequence[float]) -> Camera:
 
 def turned_gradient(vectors: Tensor, by_turn: Tensor) -> Tensor:
     """Return gradients (v, 3) by rotation vectors from those by a small further turn, R exp([w]x) exp([turn]x)."""
-    found, term = by_turn.clone(), by_turn
+    total, term = by_turn.clone(), by_turn
     for order in range(2, 9):  # the transposed right Jacobian of the exponential map, as a series
         term = torch.linalg.cross(vectors, term) / order
-        found += term
-    return found
+        total += term
+    return total
 
 
 def with_pose_gradient(field: GaussianField, movement: Tensor, centre: Tensor, unit: float) -> GaussianField:
@@ -82,7 +82,7 @@ class _PassOn(torch.autograd.Function):
 
 def _turn_of_gaussians(quaternions: Tensor, by_quaternions: Tensor) -> Tensor:
     """Return the gradient (3,) by a turn of all Gaussians, each about its centre; quaternions are wxyz."""
-    (w, axis), (by_w, by_axis) = ((each[:, :1], each[:, 1:]) for each in (quaternions, by_quaternions))
+    (w, axis), (by_w, by_axis) = ((part[:, :1], part[:, 1:]) for part in (quaternions, by_quaternions))
     turn: Tensor = 0.5 * (w * by_axis - by_w * axis + torch.linalg.cross(axis, by_axis)).sum(0)
     return turn
 
@@ -107,8 +107,8 @@ def _generators(dtype: torch.dtype, device: torch.device) -> Tensor:
     slopes: Tensor  # (16, 100, 3)
     slopes = torch.autograd.functional.jacobian(lambda at: sh_basis(at, MAX_SH_DEGREE).sum(0), leaf)  # type: ignore[no-untyped-call]  # torch's
     turned = torch.linalg.cross(directions.expand_as(slopes), slopes).permute(1, 0, 2)  # (100, 16, 3)
-    found: Tensor = torch.linalg.lstsq(sh_basis(directions, MAX_SH_DEGREE), turned.flatten(1)).solution
-    return found.view(16, 16, 3).permute(2, 1, 0).to(device, dtype)  # from j, k, axis
+    solution: Tensor = torch.linalg.lstsq(sh_basis(directions, MAX_SH_DEGREE), turned.flatten(1)).solution
+    return solution.view(16, 16, 3).permute(2, 1, 0).to(device, dtype)  # from j, k, axis
 
 
 def _cross_matrix(vector: Tensor) -> Tensor:
