@@ -156,8 +156,8 @@ def _spacing(points: Tensor) -> Tensor:
 
     Copies of a point are no neighbours of it, or it would start too small to be seen.
     """
-    first, place, cell = places_of(points)
-    squares = mean_squared_distance(points[first])[place]
+    first, index, cell = places_of(points)
+    squares = mean_squared_distance(points[first])[index]
     return squares.sqrt().clamp_min(cell) if cell > 0.0 else torch.full_like(squares, SINGLE_SIZE)
 
 
@@ -176,8 +176,8 @@ def places_of(points: Tensor) -> tuple[Tensor, Tensor, float]:
     distances = np.linalg.norm(away, axis=1)
     cell = SAME_PLACE * float(np.median(distances) or distances.mean())  # most points may be at one place
     cells = np.round(away / cell) if cell > 0.0 else away
-    _, first, place = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    first_rows, places = (torch.from_numpy(each.reshape(-1)).to(points.device) for each in (first, place))
+    _, first, index = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    first_rows, places = (torch.from_numpy(rows.reshape(-1)).to(points.device) for rows in (first, index))
     return first_rows, places, cell
 
 

@@ -78,7 +78,7 @@ class HierarchySettings:
         "image, as in the paper. nested: each level continues training the coarser level's field at the finer size; "
         "the result is one ordinary field.",
         panel=PANEL,
-        choices=tuple(each.value for each in Hierarchy),
+        choices=tuple(kind.value for kind in Hierarchy),
     )
     protocol: str = option(
         "default",
@@ -209,20 +209,20 @@ class HierarchySettings:
         Raises:
             UserInputError: another value was given.
         """
-        declared = {each.name: each for each in fields(self)}
-        for name, value in self.paper_settings.items():
-            if (given := getattr(self, name)) not in (declared[name].default, value):
+        declared = {field.name: field for field in fields(self)}
+        for name, paper in self.paper_settings.items():
+            if (value := getattr(self, name)) not in (declared[name].default, paper):
                 raise UserInputError(
-                    f"{option_name(declared[name])} {given} with --protocol paper: the paper has {value}; leave one out"
+                    f"{option_name(declared[name])} {value} with --protocol paper: the paper has {paper}; leave one out"
                 )
-            object.__setattr__(self, name, value)  # the dataclass is frozen
+            object.__setattr__(self, name, paper)  # the dataclass is frozen
 
     def _refuse_residual_settings(self) -> None:
-        for each in fields(self):
-            given = getattr(self, each.name)
-            if each.name in IDLE_WITHOUT_RESIDUALS and given not in (None, IDLE_WITHOUT_RESIDUALS[each.name]):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in IDLE_WITHOUT_RESIDUALS and value not in (None, IDLE_WITHOUT_RESIDUALS[field.name]):
                 raise UserInputError(
-                    f"{option_name(each)} {given}: is about residuals, and nested levels have none; leave it out, or "
+                    f"{option_name(field)} {value}: is about residuals, and nested levels have none; leave it out, or "
                     f"add --hierarchy {Hierarchy.LAPLACIAN.value} to train residuals"
                 )
 
