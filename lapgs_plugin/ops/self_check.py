@@ -40,15 +40,15 @@ class SelfCheck:
         """Run the comparison now."""
         try:
             with torch.inference_mode(False), torch.enable_grad():  # whatever mode the caller is in
-                found = self.difference(device)
+                difference = self.difference(device)
         except ImportError as error:  # Triton comes with PyTorch for CUDA on Linux only
             logger.info("%s: %s", self._fallback, _in_one_line(error))
             return False
         except Exception as error:  # Triton reports a missing C compiler and the like in errors of many classes
             logger.warning("%s: %s", self._fallback, _in_one_line(error))
             return False
-        if not found <= self._limit:
-            logger.warning("%s, because our kernels are off by %g here", self._fallback, found)
+        if not difference <= self._limit:
+            logger.warning("%s, because our kernels are off by %g here", self._fallback, difference)
             return False
         return True
 

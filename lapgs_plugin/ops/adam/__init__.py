@@ -93,20 +93,20 @@ def triton_works(device: torch.device) -> float:
     generator = torch.Generator().manual_seed(0)
     shapes: list[tuple[int, ...]] = [(700, 3), (700, 4), (700, 3), (700,), (700, 16, 3)]
     starts = [torch.randn(shape, generator=generator).to(device) for shape in shapes]
-    found, expected = ([torch.nn.Parameter(start.clone()) for start in starts] for _ in range(2))
+    stepped, expected = ([torch.nn.Parameter(start.clone()) for start in starts] for _ in range(2))
     optimizers, references = (
         [
             GpuFieldAdam(param, lr=i / 100, rest_scale=0.05 if param.ndim == 3 else 1.0)
             for i, param in enumerate(params, start=1)
         ]
-        for params in (found, expected)
+        for params in (stepped, expected)
     )
     for scale in (ONE_VIEW, ONE_VIEW, StepScale.of(4)):
-        for one, other in zip(found, expected, strict=True):
+        for one, other in zip(stepped, expected, strict=True):
             one.grad = other.grad = torch.randn(one.shape, generator=generator).to(device)
         step_together(optimizers, scale)
         step_torch([reference.next_step(scale) for reference in references], scale.views, scale.gradient)
     return largest(
         (one - other).abs() / (other - start).abs().max()
-        for one, other, start in zip(found, expected, starts, strict=True)
+        for one, other, start in zip(stepped, expected, starts, strict=True)
     )

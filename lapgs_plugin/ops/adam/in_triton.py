@@ -97,10 +97,10 @@ def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:
     """Do `step_torch` for the five float32 tensors of a field, n rows each, on one CUDA device."""
     n = slots[0].values.shape[0]
     keep1, keep2 = (beta**views for beta in BETAS)
-    given: list[Tensor | float] = []
+    arguments: list[Tensor | float] = []
     for slot in slots:
         unbias1, unbias2 = _unbiased(slot.step, BETAS)
-        given += *slot[:4], slot.rate * unbias1, slot.rest * unbias1, unbias2
-    given += gradient, keep1, 1 - keep1, keep2, 1 - keep2, ADAM_EPS, n
+        arguments += *slot[:4], slot.rate * unbias1, slot.rest * unbias1, unbias2
+    arguments += gradient, keep1, 1 - keep1, keep2, 1 - keep2, ADAM_EPS, n
     columns = {name: slot.values.numel() // n for name, slot in zip(COLUMNS, slots, strict=True)}
-    launch(_kernel, (blocks(n, BLOCK),), *given, **columns, block=BLOCK)
+    launch(_kernel, (blocks(n, BLOCK),), *arguments, **columns, block=BLOCK)

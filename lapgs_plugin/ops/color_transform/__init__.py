@@ -32,10 +32,10 @@ def triton_works(device: torch.device) -> float:
     # Channels last in memory, as gsplat returns images: the kernel compiled here is then the one used later.
     image = torch.linspace(-1, 1, 2 * 3 * 37 * 50, device=device).view(2, 37, 50, 3).permute(0, 3, 1, 2)
     transform = torch.linspace(-1, 1, 24, device=device).view(2, 3, 4)
-    found = []
+    results = []
     for version in (transform_colors_torch, transform_colors_triton):
         leaves = image.clone().requires_grad_(), transform.clone().requires_grad_()
         result = version(*leaves)
         by_image, by_transform = torch.autograd.grad(result.square().mean(), leaves)
-        found.append((result.detach(), by_image * image.numel() / 2, by_transform))
-    return largest((one - other).abs() for one, other in zip(*found, strict=True))
+        results.append((result.detach(), by_image * image.numel() / 2, by_transform))
+    return largest((one - other).abs() for one, other in zip(*results, strict=True))

@@ -67,17 +67,17 @@ def triton_works(device: torch.device) -> float:
     prediction = (target + 0.1 * (40 * target).sin()).requires_grad_()
     levels = (255 * target).round().to(torch.uint8).contiguous()
     exact = prediction.double(), decoded(levels).double()  # GPUs convolve float32 with fewer bits
-    found = []
+    results = []
     for loss in (photometric_loss_triton(prediction, levels, 0.2), photometric_loss_torch(*exact, 0.2)):
-        found.append((loss, torch.autograd.grad(3.0 * loss, prediction)[0] * target.numel()))
-    return largest((one - other).abs() for one, other in zip(*found, strict=True))
+        results.append((loss, torch.autograd.grad(3.0 * loss, prediction)[0] * target.numel()))
+    return largest((one - other).abs() for one, other in zip(*results, strict=True))
 
 
 @lru_cache(maxsize=1)
 def fused_ssim() -> Callable[[Tensor, Tensor], Tensor] | None:
     """Return the function of the package `fused_ssim`, mean SSIM of (b, c, h, w) images; None without the package."""
     try:
-        found: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
+        mean_ssim: Callable[[Tensor, Tensor], Tensor] = import_module("fused_ssim").fused_ssim
     except ImportError:
         return None
-    return found
+    return mean_ssim

@@ -17,7 +17,7 @@ SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """SSIM of 3DGS: an 11x11 Gaussian window, and the stabilisers for a dynamic range of 1."""
 _gauss = [math.exp(-(tap**2) / (2 * SSIM_SIGMA**2)) for tap in range(-SSIM_RADIUS, SSIM_RADIUS + 1)]
-SSIM_WINDOW = tuple(each / math.fsum(_gauss) for each in _gauss)
+SSIM_WINDOW = tuple(weight / math.fsum(_gauss) for weight in _gauss)
 """The window along one side."""
 
 

@@ -220,9 +220,9 @@ def _launch_of(
     b, _, h, w = prediction.shape
     strips = blocks(blocks(w, 2) * COLORS, BLOCK)
     rows = rows_of_program(h, strips * b, LEAST_ROWS)
-    each = 1 / prediction.numel()
+    per_value = 1 / prediction.numel()
     scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
-    weights = (1 - ssim_weight) * each, ssim_weight * each
+    weights = (1 - ssim_weight) * per_value, ssim_weight * per_value
     (*x_strides, x_column), (*y_strides, y_column) = prediction.stride(), target.stride()
     numbers = h, w, rows, scale, *weights, *x_strides, *y_strides
     columns = {"x_column": x_column, "y_column": y_column, "interleaved": prediction.stride(1) == 1}

@@ -56,5 +56,5 @@ def add_noise_triton(
     Args:
         seed: from 0 to 2^31 - 1; the same one draws the same noise.
     """
-    n, given = len(means), (means, quaternions, log_scales, opacity_logits)
-    launch(_kernel, (blocks(n, BLOCK),), *given, amount, seed, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)
+    n, parameters = len(means), (means, quaternions, log_scales, opacity_logits)
+    launch(_kernel, (blocks(n, BLOCK),), *parameters, amount, seed, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)

@@ -47,9 +47,9 @@ def triton_works(device: torch.device) -> float:
     logits, log_scales, *before = (
         torch.randn(700, *columns, generator=generator).to(device) for columns in ((), (3,), (), (3,))
     )
-    found = [each.clone() for each in before]
-    add_regularization_triton(logits, log_scales, found[0], found[1], 300.0, 200.0)
+    gradients = [gradient.clone() for gradient in before]
+    add_regularization_triton(logits, log_scales, gradients[0], gradients[1], 300.0, 200.0)
     leaves = [logits.requires_grad_(), log_scales.requires_grad_()]
     term = 300.0 * logits.sigmoid().mean() + 200.0 * log_scales.exp().mean()
     expected = [added + begun for added, begun in zip(torch.autograd.grad(term, leaves), before, strict=True)]
-    return largest((one - other).abs() / other.abs().max() for one, other in zip(found, expected, strict=True))
+    return largest((one - other).abs() / other.abs().max() for one, other in zip(gradients, expected, strict=True))

@@ -33,5 +33,5 @@ def add_regularization_triton(
 ) -> None:  # fmt: skip
     """Do `add_regularization_torch` for contiguous float32 tensors on one CUDA device, not empty."""
     n = len(opacity_logits)
-    given = opacity_logits, log_scales, by_logits, by_log_scales
-    launch(_kernel, (blocks(n, BLOCK),), *given, opacity_weight / n, scale_weight / (3 * n), n, block=BLOCK)
+    tensors = opacity_logits, log_scales, by_logits, by_log_scales
+    launch(_kernel, (blocks(n, BLOCK),), *tensors, opacity_weight / n, scale_weight / (3 * n), n, block=BLOCK)

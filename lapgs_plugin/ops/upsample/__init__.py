@@ -90,13 +90,13 @@ def triton_works(device: torch.device) -> float:
         torch.linspace(-1, 1, 3 * side * side, device=device).square().view(side, side, 3).permute(2, 0, 1)
         for side in (5, 10)
     )
-    found = []
+    results = []
     for up in (pyramid.up, lambda image, size: upsample_triton(pyramid, image, size)):
         leaf = coarse.clone().requires_grad_()
         image = up(leaf, (10, 10))
         (gradient,) = torch.autograd.grad((image * fine).sum(), leaf)
-        found.append((image.detach(), gradient))
-    (image, gradient), (in_triton, gradient_in_triton) = found
+        results.append((image.detach(), gradient))
+    (image, gradient), (in_triton, gradient_in_triton) = results
     pairs = (
         (in_triton, image),
         (gradient_in_triton, gradient),

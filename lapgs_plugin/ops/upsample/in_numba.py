@@ -49,18 +49,18 @@ def across_weights(first: Integers, weights: Floats) -> Floats:
     """
     fine, taps = weights.shape
     pitch = -(-((fine + 1) // 2) // WIDTH) * WIDTH
-    found = np.zeros((2, NEIGHBOURS, pitch), weights.dtype)
+    across = np.zeros((2, NEIGHBOURS, pitch), weights.dtype)
     i = np.arange(fine)
     for tap in range(taps):
         neighbour = first + tap - i // 2 + BEFORE
         used = weights[:, tap] != 0
-        found[i[used] % 2, neighbour[used], i[used] // 2] = weights[used, tap]
-    return found
+        across[i[used] % 2, neighbour[used], i[used] // 2] = weights[used, tap]
+    return across
 
 
 @inline
 def _upsample_row(
-    coarse: Floats, start: int, length: int, weights: Floats, pitch: int, row: Floats, out: Floats, place: int
+    coarse: Floats, start: int, length: int, weights: Floats, pitch: int, row: Floats, out: Floats, to: int
 ) -> None:
     """Upsample a row of `length` coarse samples; `row` is scratch space for them and their neighbours."""
     for x in range(length):
@@ -71,7 +71,7 @@ def _upsample_row(
             value = load(row, i + k)
             even = fma(value, load(weights, k * pitch + i), even)
             odd = fma(value, load(weights, (NEIGHBOURS + k) * pitch + i), odd)
-        store_columns(out, place + 2 * i, even, odd)
+        store_columns(out, to + 2 * i, even, odd)
 
 
 @jit
@@ -101,20 +101,20 @@ def _kernel(
         bottom = min(top + _STRIP_ROWS, height)
         start, stop = first_row[top], first_row[bottom - 1] + taps
         for y in range(start, stop):
-            place = (plane * coarse_height + y) * coarse_width
-            _upsample_row(below, place, coarse_width, across, pitch, row, upsampled, (y - start) * wide)
+            offset = (plane * coarse_height + y) * coarse_width
+            _upsample_row(below, offset, coarse_width, across, pitch, row, upsampled, (y - start) * wide)
         for y in range(top, bottom):
-            place, first = (plane * height + y) * width, (first_row[y] - start) * wide
+            offset, first = (plane * height + y) * width, (first_row[y] - start) * wide
             for x in range(0, whole, WIDTH):
-                total = load(above, place + x) if adds else splat(above, 0.0)
+                total = load(above, offset + x) if adds else splat(above, 0.0)
                 for tap in range(taps):
                     total = fma(load(upsampled, first + tap * wide + x), down[y * taps + tap], total)
-                store(result, place + x, total)
+                store(result, offset + x, total)
             for x in range(whole, width):
-                rest = above[place + x] if adds else fine.dtype.type(0)
+                rest = above[offset + x] if adds else fine.dtype.type(0)
                 for tap in range(taps):
                     rest += upsampled[first + tap * wide + x] * down[y * taps + tap]
-                result[place + x] = rest
+                result[offset + x] = rest
     keep_alive(memory)
     keep_alive(padded)
 

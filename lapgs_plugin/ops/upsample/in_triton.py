@@ -148,8 +148,8 @@ def _filter(
     source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None, *, clamps: bool = False
 ) -> None:
     """Write weighted sums of `source`, plus `added` if given, to `out`; clamped to [0, 1] if asked for."""
-    given = (source, out if added is None else added, out)
-    images = [image if image.ndim == 4 else image[None] for image in given]  # (b, c, ..., ...) each
+    tensors = (source, out if added is None else added, out)
+    images = [image if image.ndim == 4 else image[None] for image in tensors]  # (b, c, ..., ...) each
     b, planes, height, width = images[2].shape
     strips = blocks(planes * width, BLOCK)
     count = rows_of_program(height, strips * b, LEAST_ROWS)
