@@ -310,8 +310,8 @@ class RunArchive(RunFiles):
         Raises:
             RunFolderError: the file is damaged.
         """
-        found: Exposures | None = self._learned(level, EXPOSURE, Exposures)
-        return found
+        learned: Exposures | None = self._learned(level, EXPOSURE, Exposures)
+        return learned
 
     def poses(self, level: int) -> Poses | None:
         """Read the corrections of the training photos' poses after a finished level; None without refinement.
@@ -319,8 +319,8 @@ class RunArchive(RunFiles):
         Raises:
             RunFolderError: the file is damaged.
         """
-        found: Poses | None = self._learned(level, POSES, Poses)
-        return found
+        learned: Poses | None = self._learned(level, POSES, Poses)
+        return learned
 
     def _learned(self, level: int, name: str, kind: Any) -> Any:
         """Read what a level learned of the training photos; None if it has no such file."""

@@ -36,7 +36,7 @@ from lapgs_plugin.hierarchy.settings import AUTO, PLACES, PRECISIONS
 DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISIONS}
 
 GPU_LIMIT = 1 << 30
-"""Most bytes of a stage's images that `place` keeps on a GPU of any size."""
+"""Most bytes of a stage's images that `choose_place` keeps on a GPU of any size."""
 GPU_SHARE = 0.1
 """The same as a share of the GPU's memory: the rest is for Gaussians and what they need to be trained."""
 
@@ -48,8 +48,8 @@ LOADERS = 2
 """Threads that read files: one can read while the other's image is being copied."""
 
 
-def place(total_bytes: int, device: torch.device | str) -> str:
-    """Return the place for so many bytes of images: "gpu" if they are a small part of its memory, or "memory"."""
+def choose_place(total_bytes: int, device: torch.device | str) -> str:
+    """Choose where to keep so many bytes of images: "gpu" if they are a small part of its memory, else "memory"."""
     if torch.device(device).type != "cuda":
         return "memory"
     available = torch.cuda.get_device_properties(torch.device(device)).total_memory

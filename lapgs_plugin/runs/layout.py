@@ -135,7 +135,7 @@ def require_utf8(folder: Path, option: str) -> None:
 
 def _oldest(path: Path) -> int:
     """Return when a file, or the oldest file in a folder, was last written, in nanoseconds."""
-    return min(each.lstat().st_mtime_ns for each in (path, *path.rglob("*")))
+    return min(entry.lstat().st_mtime_ns for entry in (path, *path.rglob("*")))
 
 
 def exists(path: Path) -> bool:

@@ -14,7 +14,7 @@ from lapgs_plugin.hierarchy.masks import masked_gaussian
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.runs.image_store import DTYPES, ImageStore, place
+from lapgs_plugin.runs.image_store import DTYPES, ImageStore, choose_place
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
 
@@ -49,7 +49,7 @@ class ImageStores:
         """Return an empty store for images of a level; `beside` are bytes of others that are needed with them."""
         where = self.where
         if where == AUTO:
-            where = place(self.num_bytes(level, precision) + beside, self.device)
+            where = choose_place(self.num_bytes(level, precision) + beside, self.device)
         elif where == "gpu" and self.device.type == "cpu":
             where = "memory"
         folder = None if self.folder is None else self.folder / name
@@ -142,7 +142,7 @@ class LevelImages:
             weight = torch.ones_like(images[self._level][:1])
         else:
             masked = masked_gaussian(self._pyramid, image, mask.to(self._device), levels)
-            images, weight = [each for each, _ in masked], masked[self._level][1]
+            images, weight = [levels_image for levels_image, _ in masked], masked[self._level][1]
         if self.weights is not None:
             self.weights.put(name, weight)
         target = images[self._level]

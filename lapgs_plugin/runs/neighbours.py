@@ -48,8 +48,8 @@ def predicted_poses(learned: Poses, views: Iterable[str]) -> Poses:
     names = sorted(learned)
     rows = torch.tensor([learned[name] for name in names], dtype=torch.float64)  # (v, 6)
     sizes = rows.view(-1, 2, 3).square().mean((0, 2)).sqrt().clamp_min(1e-12).repeat_interleave(3)  # radians, lengths
-    found = _predicted(names, rows / sizes, torch.zeros(6), views)
-    return {name: (row * sizes).tolist() for name, row in found.items()}
+    predicted = _predicted(names, rows / sizes, torch.zeros(6), views)
+    return {name: (row * sizes).tolist() for name, row in predicted.items()}
 
 
 def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterable[str]) -> dict[str, Tensor]:
@@ -72,8 +72,8 @@ def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterabl
         by_neighbours = (middle - (values[:-2] + values[2:]) / 2).square().sum()
         if by_neighbours > LARGEST_ERROR * (middle - neutral).square().sum():
             return {}
-    found = {name: known[name] for name in wanted if name in known}
+    predicted = {name: known[name] for name in wanted if name in known}
     for name in unknown:
-        place = bisect(names, name)
-        found[name] = values[max(place - 1, 0) : place + 1].mean(dim=0)
-    return found
+        index = bisect(names, name)
+        predicted[name] = values[max(index - 1, 0) : index + 1].mean(dim=0)
+    return predicted

@@ -154,8 +154,12 @@ class RunFiles:
         path = self.path(CHECKPOINT)
         if not self._manifest.complete or not exists(path):
             return None
-        found = read_tensors(path, FORGET_EXTENSION).get("extends_to")
-        return found if type(found) is int and found > int(self._manifest.settings.get("iterations", 0)) else None
+        iterations = read_tensors(path, FORGET_EXTENSION).get("extends_to")
+        return (
+            iterations
+            if type(iterations) is int and iterations > int(self._manifest.settings.get("iterations", 0))
+            else None
+        )
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """Read the checkpoint of the next level to train, its tensors on the CPU; None if there is none.
@@ -172,8 +176,8 @@ class RunFiles:
         saved = read_tensors(path, advice)
         level, state = saved.get("level"), saved.get("state")
         if type(level) is not int or not isinstance(state, dict):
-            found = f"level {shortened(level)} and a state that is a {type(state).__name__}"
-            raise RunFolderError(f"{path} holds {found}, expected a number and a dictionary; {advice}")
+            contents = f"level {shortened(level)} and a state that is a {type(state).__name__}"
+            raise RunFolderError(f"{path} holds {contents}, expected a number and a dictionary; {advice}")
         if level == self._manifest.next_level or (level == 0 and self.extends_to is not None):
             return state
         if level not in self.available_levels:

@@ -67,17 +67,17 @@ def _require_readable(state: dict[str, Any], path: Path) -> None:
     waiting: list[tuple[str, Any]] = [("state", state)]
     seen: set[int] = set()
     while waiting:
-        place, each = waiting.pop()
-        if type(each) in PLAIN or isinstance(each, torch.Tensor) or id(each) in seen:
+        name, value = waiting.pop()
+        if type(value) in PLAIN or isinstance(value, torch.Tensor) or id(value) in seen:
             continue
-        seen.add(id(each))
-        if type(each) in (dict, OrderedDict):
-            waiting.extend((f"{place}[{key!r}]", part) for key, value in each.items() for part in (key, value))
-        elif type(each) in (list, tuple, set, torch.Size):
-            waiting.extend((f"{place}[{index}]", part) for index, part in enumerate(each))
+        seen.add(id(value))
+        if type(value) in (dict, OrderedDict):
+            waiting.extend((f"{name}[{key!r}]", part) for item in value.items() for key in item[:1] for part in item)
+        elif type(value) in (list, tuple, set, torch.Size):
+            waiting.extend((f"{name}[{index}]", part) for index, part in enumerate(value))
         else:
             raise UserInputError(
-                f"{path}: {place} is a {type(each).__name__}, expected tensors, numbers, text, None, and dictionaries "
+                f"{path}: {name} is a {type(value).__name__}, expected tensors, numbers, text, None, and dictionaries "
                 "and lists of them; convert it first"
             )
 
@@ -108,17 +108,17 @@ def _require_held(state: dict[str, Any], path: Path, advice: str) -> None:
     seen: set[int] = set()
     held, size = 0, path.stat().st_size
     while waiting:
-        each = waiting.pop()
-        if id(each) in seen:
+        value = waiting.pop()
+        if id(value) in seen:
             continue
-        seen.add(id(each))
-        if isinstance(each, torch.Tensor):
-            if each.layout != torch.strided or each.device.type != "cpu" or each.is_quantized:
-                raise RunFolderError(f"{path} holds a {each.layout} tensor, expected dense ones; {advice}")
-            held += each.nelement() * each.element_size()
-        elif isinstance(each, dict):
-            waiting.extend(each.values())
-        elif isinstance(each, (list, tuple)):
-            waiting.extend(each)
+        seen.add(id(value))
+        if isinstance(value, torch.Tensor):
+            if value.layout != torch.strided or value.device.type != "cpu" or value.is_quantized:
+                raise RunFolderError(f"{path} holds a {value.layout} tensor, expected dense ones; {advice}")
+            held += value.nelement() * value.element_size()
+        elif isinstance(value, dict):
+            waiting.extend(value.values())
+        elif isinstance(value, (list, tuple)):
+            waiting.extend(value)
     if held > size:
         raise RunFolderError(f"{path} names tensors of {held:,} bytes, expected at most its own {size:,}; {advice}")

@@ -72,8 +72,8 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
         "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
         "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
         "peak_gaussians": max(record.peak_gaussians for record in records),
-        "peak_memory_bytes": max((each["peak"] for each in memory), default=None),
-        "peak_memory_without_images_bytes": max((each["peak"] - each["images"] for each in memory), default=None),
+        "peak_memory_bytes": max((usage["peak"] for usage in memory), default=None),
+        "peak_memory_without_images_bytes": max((usage["peak"] - usage["images"] for usage in memory), default=None),
     }
 
 
@@ -85,8 +85,8 @@ def _rendered(records: Sequence[LevelRecord]) -> Sequence[LevelRecord]:
 def sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Add up the values of each name."""
     total: dict[str, float] = {}
-    for each in parts:
-        for name, value in each.items():
+    for part in parts:
+        for name, value in part.items():
             total[name] = total.get(name, 0.0) + value
     return total
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
 from lapgs_plugin.runs import image_store as imagestore
-from lapgs_plugin.runs.image_store import AHEAD, ImageStore, _PageLocked, _release, place
+from lapgs_plugin.runs.image_store import AHEAD, ImageStore, _PageLocked, _release, choose_place
 
 ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
 
@@ -240,7 +240,7 @@ def test_unknown_places_and_precisions_are_named(tmp_path: Path) -> None:
 
 
 def test_a_cpu_keeps_images_in_memory() -> None:
-    assert place(1, "cpu") == place(1 << 50, torch.device("cpu")) == "memory"
+    assert choose_place(1, "cpu") == choose_place(1 << 50, torch.device("cpu")) == "memory"
 
 
 @pytest.mark.parametrize(("memory", "limit"), [(8 << 30, (8 << 30) // 10), (80 << 30, 1 << 30)])
@@ -251,7 +251,7 @@ def test_a_gpu_keeps_images_that_are_small_beside_its_memory(
         total_memory = memory
 
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: Properties)
-    assert [place(limit + more, "cuda") for more in (-1, 0, 1)] == ["gpu", "gpu", "memory"]
+    assert [choose_place(limit + more, "cuda") for more in (-1, 0, 1)] == ["gpu", "gpu", "memory"]
 
 
 class Runtime:
