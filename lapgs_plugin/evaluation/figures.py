@@ -148,7 +148,7 @@ def _measure_view(
     photo, mask = view.image.to(renderer.device), view.mask
     targets: list[tuple[Tensor, Tensor | None]]
     if mask is None:
-        targets = [(each, None) for each in renderer.pyramid.gaussian(photo, renderer.levels)]
+        targets = [(image, None) for image in renderer.pyramid.gaussian(photo, renderer.levels)]
     else:
         mask = mask.to(renderer.device)
         targets = [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]

@@ -159,15 +159,15 @@ class Lpips(nn.Module):
         self.learned = nn.ParameterList(
             [nn.Parameter(torch.empty(1, c, 1, 1, device="meta")) for c in network.channels]
         )
-        found = {re.sub(r"^lin(\d)\.weight$", r"learned.\1", key): value for key, value in weights.items()}
+        renamed = {re.sub(r"^lin(\d)\.weight$", r"learned.\1", key): value for key, value in weights.items()}
         for key, own in self.state_dict().items():
-            if key not in found or found[key].shape != own.shape:
-                shape = tuple(found[key].shape) if key in found else "nothing"
+            if key not in renamed or renamed[key].shape != own.shape:
+                shape = tuple(renamed[key].shape) if key in renamed else "nothing"
                 raise UserInputError(
                     f"LPIPS weights of {network.title}: {key} is {shape}, expected {tuple(own.shape)}; give a file of "
                     "torchvision's weights, or one with the learned layers lin<k>.weight too"
                 )
-        self.load_state_dict({key: found[key].float() for key in self.state_dict()}, assign=True)
+        self.load_state_dict({key: renamed[key].float() for key in self.state_dict()}, assign=True)
         self.requires_grad_(False)
         self.eval()
 

@@ -72,7 +72,7 @@ def fit_colors(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Ten
         image, target: (3, h, w), clamped to [0, 1] here.
         mask: (1, h, w) bool or weights of the pixels; None counts all.
     """
-    pixels, wanted = (each.clamp(0.0, 1.0).flatten(1).double() for each in (image, target))  # (3, n)
+    pixels, wanted = (values.clamp(0.0, 1.0).flatten(1).double() for values in (image, target))  # (3, n)
     pixels = torch.cat([pixels, torch.ones_like(pixels[:1])])  # (4, n)
     counted = pixels if mask is None else pixels * mask.flatten(1)
     identity = torch.eye(3, 4, dtype=torch.float64)
@@ -94,8 +94,8 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """
     image, target = image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)
     if mask is not None:
-        each = in_torch.ssim_map(torch.where(mask, image, target)[None], target[None])[0]
-        return float(each.mean(0, keepdim=True)[mask].mean())
+        similarity = in_torch.ssim_map(torch.where(mask, image, target)[None], target[None])[0]
+        return float(similarity.mean(0, keepdim=True)[mask].mean())
     if image.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 
@@ -115,4 +115,4 @@ def mean_quality(pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, T
 
 def means(entries: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Return the mean of each figure over entries that all have it; empty without an entry."""
-    return {name: fmean(each[name] for each in entries) for name in (entries[0] if entries else ())}
+    return {name: fmean(entry[name] for entry in entries) for name in (entries[0] if entries else ())}

@@ -232,7 +232,7 @@ def evaluate_stability(
         "frames": len(cameras),
         "compared": compared,
         "baseline": None if single is None else str(single.path().absolute()),
-        "flicker": {name: {"mean": each.mean, "psnr": each.psnr} for name, each in flicker.items()},
+        "flicker": {name: {"mean": total.mean, "psnr": total.psnr} for name, total in flicker.items()},
     }
     archive.write_stability(figures)
     return figures

@@ -127,7 +127,8 @@ def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) 
     whole = to_full_size(composition.composed[level], camera.size, level, renderer.pyramid)
     base = to_full_size(composition.base, camera.size, renderer.levels - 1, renderer.pyramid)
     residuals = [
-        to_full_size(residual, camera.size, each, renderer.pyramid) for each, residual in composition.residuals.items()
+        to_full_size(residual, camera.size, level, renderer.pyramid)
+        for level, residual in composition.residuals.items()
     ]
     shown = residuals if raw else [around_grey(residual) for residual in residuals]
     return torch.cat([base, *shown, whole], dim=2)

@@ -231,7 +231,7 @@ class FieldRenderer:
             yield
         except torch.cuda.OutOfMemoryError as error:
             which = f"level {levels[0]}" if len(levels) == 1 else f"levels {levels[0]} to {levels[-1]}"
-            count = sum(len(self.fields[each]) for each in levels)
+            count = sum(len(self.fields[level]) for level in levels)
             raise DeviceMemoryError(
                 f"the GPU has no memory left to render {which}, {count:,} Gaussians at {camera.width}x{camera.height}; "
                 "render a coarser --level, a smaller size, or with --device cpu"

@@ -43,18 +43,18 @@ class HierarchyRenderer(FieldRenderer):
     """
 
     def __post_init__(self) -> None:
-        given = sorted(self.fields, reverse=True)
-        expected = list(range(self.levels - 1, -1, -1))[: len(given)]
-        if not given or given != expected:
+        finished = sorted(self.fields, reverse=True)
+        expected = list(range(self.levels - 1, -1, -1))[: len(finished)]
+        if not finished or finished != expected:
             raise UserInputError(
-                f"fields of levels {given}, expected {self.levels - 1}, ..., 0 or the first of these without gaps"
+                f"fields of levels {finished}, expected {self.levels - 1}, ..., 0 or the first of these without gaps"
             )
         signed = [self.fields[level].signed for level in expected]
         if signed[0] or len(set(signed[1:])) > 1:
-            kinds = zip(given, ("signed" if one else "unsigned" for one in signed), strict=True)
-            found = ", ".join(f"{level} {kind}" for level, kind in kinds)
+            kinds = zip(finished, ("signed" if one else "unsigned" for one in signed), strict=True)
+            listed = ", ".join(f"{level} {kind}" for level, kind in kinds)
             raise UserInputError(
-                f"fields of levels {found}; expected the coarsest, {self.levels - 1}, unsigned (the base), and the "
+                f"fields of levels {listed}; expected the coarsest, {self.levels - 1}, unsigned (the base), and the "
                 "others all signed (residuals) or, where levels are nested, all unsigned"
             )
 
@@ -84,7 +84,7 @@ class HierarchyRenderer(FieldRenderer):
         manifest = archive.manifest
         manifest.record(manifest.levels - 1)
         fields: dict[int, GaussianField] = {}
-        for level in (each for each in archive.available_levels if each >= finest):
+        for level in filter(lambda available: available >= finest, archive.available_levels):
             try:
                 fields[level] = archive.field(level)
             except RunFolderError as error:
@@ -128,8 +128,8 @@ class HierarchyRenderer(FieldRenderer):
         """Return the levels whose fields `images` renders, coarsest first; arguments as it takes them."""
         levels = range(self.levels - 1, level - 1, -1)
         if not self.nested:
-            return [each for each in levels if gains.get(each, 1.0) != 0.0]
-        return [level] if all(gains.get(each, 1.0) == 1.0 for each in levels) else list(levels)
+            return [coarser for coarser in levels if gains.get(coarser, 1.0) != 0.0]
+        return [level] if all(gains.get(coarser, 1.0) == 1.0 for coarser in levels) else list(levels)
 
     def fields_for_band(self, level: int, gain: float = 1.0) -> list[int]:
         """Return the levels whose fields `band` renders, coarsest first; arguments as it takes them."""
@@ -244,8 +244,8 @@ class HierarchyRenderer(FieldRenderer):
     ) -> Composition:
         """Render and compose these levels, coarsest first. With nested levels the first may be any."""
         if len(sizes := {camera.size for camera in cameras}) != 1:
-            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
-            raise UserInputError(f"cameras of {found} pixels, expected one size in a batch; render them by size")
+            listed = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)) or "none"
+            raise UserInputError(f"cameras of {listed} pixels, expected one size in a batch; render them by size")
         nested = self.nested  # a nested field's image includes the coarser bands, so none can be omitted
         omitted = [] if nested else [level for level in levels if gains.get(level, 1.0) == 0.0]
         renders = self.render_fields(cameras, levels, omitted)
@@ -254,11 +254,11 @@ class HierarchyRenderer(FieldRenderer):
     def _checked(self, level: int, gains: Mapping[int, float] | None) -> Mapping[int, float]:
         """Check a level and gains, and return the gains."""
         self.require_level(level)
-        for each, gain in (gains or {}).items():
-            self.require_level(each)
+        for band, gain in (gains or {}).items():
+            self.require_level(band)
             if not (math.isfinite(gain) and 0.0 <= gain <= LARGEST_GAIN):
                 raise UserInputError(
-                    f"gain {gain:g} of level {each}: expected a number from 0 (leave the band out) to "
+                    f"gain {gain:g} of level {band}: expected a number from 0 (leave the band out) to "
                     f"{LARGEST_GAIN:g}; 1 is the band as trained"
                 )
         return gains or AS_TRAINED

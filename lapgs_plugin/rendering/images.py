@@ -65,7 +65,7 @@ def side_by_side(panels: Mapping[str, Tensor]) -> Tensor:
     draw, font = ImageDraw.Draw(captions), ImageFont.load_default(size=round(0.7 * strip))
     for index, name in enumerate(panels):
         draw.text(((index + 0.5) * width, strip / 2), name, fill=0, font=font, anchor="mm")
-    images = torch.cat([each.cpu() for each in panels.values()], dim=2)
+    images = torch.cat([panel.cpu() for panel in panels.values()], dim=2)
     drawn = torch.from_numpy(np.array(captions)).to(images) / 255.0  # (strip, panels * w)
     return torch.cat([drawn.expand(3, -1, -1), images], dim=1)
 

@@ -72,17 +72,17 @@ def unit(vector: Vector) -> Vector:
     return vector / np.linalg.norm(vector)
 
 
-def looking(lens: Camera, place: Vector, at: Vector, up: Vector) -> Camera:
+def looking(lens: Camera, position: Vector, at: Vector, up: Vector) -> Camera:
     """Return a camera with this lens at `place`, looking at `at`, with `up` upwards in its image; all (3,)."""
-    ahead = unit(at - place)
+    ahead = unit(at - position)
     right = unit(np.cross(ahead, up))
-    return posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), place)
+    return posed(lens, np.stack([right, np.cross(ahead, right), ahead], axis=1), position)
 
 
-def posed(lens: Camera, rotation: NDArray[np.float64], place: Vector) -> Camera:
+def posed(lens: Camera, rotation: NDArray[np.float64], position: Vector) -> Camera:
     """Return a camera with this lens and a pose: rotation camera to world, (3, 3), and centre, (3,)."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ place
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ position
     return replace(lens, world_to_camera=torch.from_numpy(pose).float())
 
 

@@ -93,7 +93,7 @@ def _measured(renderer: HierarchyRenderer, kind: _Kind, cameras: Sequence[Camera
     shown = level_camera(cameras[0], kind.size_level)
     frames = [cameras[i : i + kind.views] for i in range(0, len(cameras) - kind.views + 1, kind.views)]
     milliseconds = _median_milliseconds(kind.frame, frames * (rounds + 1), len(frames), renderer.device) / kind.views
-    gaussians = sum(len(renderer.fields[each]) for each in kind.fields)
+    gaussians = sum(len(renderer.fields[level]) for level in kind.fields)
     return Speed(kind.what, (shown.width, shown.height), gaussians, milliseconds)
 
 

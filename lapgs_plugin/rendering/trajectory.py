@@ -58,7 +58,7 @@ def orbit(rig: Rig, frames: int) -> list[Camera]:
     lens = _median_lens(rig.cameras)
     angles = 2.0 * math.pi * np.arange(frames) / frames
     places = [centre + radius * (math.cos(angle) * first + math.sin(angle) * second) for angle in angles]
-    return [looking(lens, place, rig.focus, rig.up) for place in places]
+    return [looking(lens, position, rig.focus, rig.up) for position in places]
 
 
 def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -87,7 +87,7 @@ def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     when = np.linspace(0.0, times[-1], frames)
     places = CubicSpline(times, positions)(when)
     turned = RotationSpline(times, Rotation.from_matrix(rotations))(when).as_matrix()
-    return [posed(lens, rotation, place) for rotation, place in zip(turned, places, strict=True)]
+    return [posed(lens, rotation, position) for rotation, position in zip(turned, places, strict=True)]
 
 
 def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
