@@ -25,7 +25,6 @@ SIGNED_COMMENT = "lapgs_signed 1"
 SH_REST_COUNTS = (0, 9, 24, 45)
 """Number of f_rest_* properties of a PLY of SH degree 0 to 3: (degree + 1)^2 - 1 for each of three channels."""
 
-
 SPLAT_NAMES = {"means": "means", "quats": "quaternions", "scales": "log_scales", "opacities": "opacity_logits"}
 """Attributes of a field, except SH, by the names of gsplat's trainers and strategies."""
 

@@ -43,8 +43,8 @@ def turned_gradient(vectors: Tensor, by_turn: Tensor) -> Tensor:
 def with_pose_gradient(field: GaussianField, movement: Tensor, centre: Tensor, unit: float) -> GaussianField:
     """Return the same field, whose gradients are also passed on to the pose of the camera that renders it.
 
-    A camera that moves sees what it would see if the scene moved the other way. So the gradient by its pose follows
-    from those by the Gaussians, for any rasterizer.
+    A camera that moves sees the scene move the other way. So the gradient by its pose follows from those by the
+    Gaussians, for any rasterizer.
 
     Args:
         field: for one render of one camera; parameters require gradients.
@@ -59,7 +59,7 @@ def with_pose_gradient(field: GaussianField, movement: Tensor, centre: Tensor, u
 
 
 class _PassOn(torch.autograd.Function):
-    """Map (movement, centre, unit, means, quaternions, sh) to the last three as they are."""
+    """Return means, quaternions and SH unchanged, and pass their gradients on to the movement too."""
 
     @staticmethod
     def forward(

@@ -95,7 +95,7 @@ class Rasterizer(ABC):
 
     @property
     def semantics(self) -> Semantics:
-        """Where it differs from the oracle by design, for `lapgs conformance`."""
+        """Differences from the oracle by design, for `lapgs conformance`."""
         return Semantics()
 
     @abstractmethod

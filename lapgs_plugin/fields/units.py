@@ -15,7 +15,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack, Rasterizer, RenderResult, Semantics
 
 NEAREST_DEPTH = 3.0
-"""Median depths of sparse points from here to its double are left as they are; COLMAP's scenes have them."""
+"""Least median depth of a scene's points in the rasterizer's unit. COLMAP's scenes lie between it and its double."""
 
 
 def unit_of_depth(depth: float) -> float:
@@ -24,7 +24,7 @@ def unit_of_depth(depth: float) -> float:
 
 
 def in_unit(rasterizer: Rasterizer, unit: float) -> Rasterizer:
-    """Return a rasterizer of the same images for which a length of `unit` is 1, also in its near plane."""
+    """Wrap a rasterizer so that its near plane and guards are in lengths of `unit`; images stay the same."""
     return rasterizer if unit == 1.0 else InUnit(rasterizer, unit)
 
 
