@@ -1,4 +1,4 @@
-"""Plan the stages of a hierarchy: which level is trained when, at what size, for how long. Imports no torch."""
+"""Plan the stages of a hierarchy: the level that each trains, its size, its iterations. Imports no torch."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ split as in the paper.
 """
 
 NESTED_DENSIFY_SHARE = 2 / 3
+"""Share of the usual iterations in which a stage densifies that continues the coarser level's field. Its surfaces exist
+already, so late densification costs more time than it gains."""
 NESTED_DENSIFY_LEAST = 4000
-"""A stage that continues the coarser level's field densifies for this share of the usual iterations, but for at least
-this number, or for all of them if there are fewer. Its surfaces exist already: in a long run late densification costs
-more time than it gains, in a short run it is needed."""
+"""Least number of these iterations, or all of them if there are fewer: a short run needs its late densification."""
 
 
 class Hierarchy(str, Enum):
-    """Say what the field of each level but the coarsest represents."""
+    """Choose the image that the field of each level but the coarsest represents."""
 
     NESTED = "nested"
     """The whole image: the coarser level's field, trained further at the finer size."""
@@ -82,12 +82,12 @@ def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Stage:
-    """Describe one stage: which level is trained, at what size, for how long.
+    """Describe one stage: the level that is trained, its size, its iterations.
 
     Attributes:
         level: pyramid level; 0 is full resolution, `levels - 1` the coarsest.
         image_size: (width, height) in pixels of this level for an image of the plan's size.
-        iterations: iterations of this stage, the views that it trains on; at least 1.
+        iterations: of this stage, one for each view that it trains on; at least 1.
         signed: True for a residual (raw SH value, zero background), False for the base and for nested levels.
     """
 
@@ -103,8 +103,8 @@ class StagePlan:
 
     Attributes:
         stages: one per level.
-        hierarchy: what the fields after the first represent. The default is residuals, which custom training loops
-            compose (examples/); our commands always pass it.
+        hierarchy: the kind of the fields after the first. Residuals are the default of custom training loops
+            (examples/); our commands always pass it.
 
     Raises:
         UserInputError: the levels do not run from the coarsest down to 0, a stage has no iterations or is too small to
@@ -175,7 +175,7 @@ class StagePlan:
             levels: number of levels L, at least 1.
             split: share of each stage, coarsest first, summing to 1. None takes `DEFAULT_SPLITS`; with more than four
                 levels, the first and last stage get a third each and the others share the rest evenly.
-            hierarchy: what the fields after the first represent, also by name: "laplacian" or "nested".
+            hierarchy: the kind of the fields after the first, also by name: "laplacian" or "nested".
 
         Raises:
             UserInputError: an image without pixels, fewer iterations than levels, shares that are not one positive

@@ -32,7 +32,7 @@ def blended_pixels(images: Iterable[Tensor], coefficients: Tensor) -> Tensor:
 
 
 def unpruned_line(share: float, level: int) -> str:
-    """Return the line that tells a user that --prune leaves a level as it is."""
+    """Return the line that tells a user why --prune has no effect on a level."""
     return f"--prune {share}: level {level} is not pruned: no densification ends in its iterations"
 
 

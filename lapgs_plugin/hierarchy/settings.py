@@ -30,8 +30,8 @@ JOINT_SHARE = {Hierarchy.NESTED: 0.0, Hierarchy.LAPLACIAN: 0.25}
 """Default share of a residual stage, at its end, in which the finished coarser fields are trained as well: a frozen
 coarse level cannot correct errors that the finer level is unable to represent."""
 LARGE_IMAGE = 1_500_000
-"""Pixels of an image from which on some defaults are others: there a view of a residual takes much longer than one of
-its base. They cost a little quality at half a megapixel, are neutral at 1.1 and 1.4, and pay from 2 on."""
+"""Pixels from which on an image is large: some defaults differ there, because a view of a residual takes much longer
+than one of its base."""
 LARGE = f"{LARGE_IMAGE / 1e6:g} megapixels"
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
@@ -173,9 +173,9 @@ class HierarchySettings:
         check_values(self)
         if self.protocol == "paper":
             self._follow_the_paper()
-        SUPERVISIONS[self.supervision]  # raises for an unknown name
+        SUPERVISIONS[self.supervision]  # raises for an unknown name, as the next check does
         if self.hooks != ALL:
-            chosen_entries("--hooks", HOOKS, self.hooks)  # as well
+            chosen_entries("--hooks", HOOKS, self.hooks)
         if not 0 <= self.seed < 2**32:
             raise UserInputError(f"--seed {self.seed}: expected 0 to {2**32 - 1}")
         if self.split is not None:
@@ -258,7 +258,7 @@ class HierarchySettings:
 
     @property
     def inherit_mode(self) -> str:
-        """What a level inherits, a mode of `inheritance.inherit`."""
+        """Mode of `inheritance.inherit`; "full" with nested levels."""
         return "full" if self.nested else parse_inheritance(self.inherit or DEFAULT_INHERITANCE)[0]
 
     @property
