@@ -38,7 +38,7 @@ VERSION = tuple(map(int, triton.__version__.split(".")[:2]))
 STARTS_DIRECTLY = (3, 0) <= VERSION <= (3, 6) and torch.version.hip is None
 
 Start = Callable[..., None]
-_starts: dict[tuple[Any, ...], Start | None] = {}  # None for what only Triton starts
+_starts: dict[tuple[Any, ...], Start | None] = {}  # None where only Triton can
 
 
 def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
@@ -68,10 +68,10 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants:
 
 
 def _start_of(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
-    """Return what starts a kernel for arguments like these; None if Triton has to."""
+    """Return a function that starts a kernel for arguments of these types; None if Triton has to."""
     if not isinstance(kernel, triton.JITFunction) or _heard(HOOKS.launch_enter_hook) or _heard(HOOKS.launch_exit_hook):
         return None
-    places = 0
+    addresses = 0
     kinds: list[Any] = []
     for argument in arguments:
         kind = type(argument)
@@ -82,9 +82,9 @@ def _start_of(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]
                 return None
             kinds.append(kind)
         else:
-            places |= argument.data_ptr()
+            addresses |= argument.data_ptr()
             kinds.append(argument.dtype)
-    if places % 16 != 0:
+    if addresses % 16 != 0:
         return None
     device = triton.runtime.driver.active.get_current_device()
     key = (kernel.fn, device, *kinds, *constants, *constants.values())
@@ -96,12 +96,12 @@ def _start_of(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]
 
 
 def _heard(hook: Any) -> bool:
-    """Return whether somebody, such as a profiler, is told of launches: a function, or several of them."""
+    """Return whether a launch hook is set, such as a profiler's: a function, or several of them."""
     return bool(getattr(hook, "calls", hook))
 
 
 def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
-    """Compile a kernel, and return what starts it; None if Triton has to."""
+    """Compile a kernel, and return a function that starts it; None if Triton has to."""
     parameters = kernel.params[: len(arguments)]
     specialized = [
         isinstance(argument, int) and not parameter.do_not_specialize
@@ -123,12 +123,14 @@ def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: d
     return start
 
 
-MOST_ROWS, ENOUGH_PROGRAMS = 64, 1500
-"""Rows of an image for a program; it takes fewer where an image would make less than so many programs."""
+MOST_ROWS = 64
+"""Most rows of an image that a program takes."""
+ENOUGH_PROGRAMS = 1500
+"""Programs of an image below which each takes fewer rows."""
 
 
 def rows_of_program(height: int, beside: int, least: int) -> int:
-    """Return the rows of an image that a program takes, from `least` on; `beside` is the number of programs a row."""
+    """Return the rows of an image that a program takes, `least` or more; `beside` is the number of programs a row."""
     rows = MOST_ROWS
     while rows > least and beside * blocks(height, rows) < ENOUGH_PROGRAMS:
         rows //= 2

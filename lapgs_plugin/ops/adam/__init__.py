@@ -63,7 +63,7 @@ class GpuFieldAdam(torch.optim.Optimizer):
         }
 
     def next_step(self, scale: StepScale) -> AdamSlot:
-        """Count a step and return what it needs; without a gradient the tensor moves by its momentum alone."""
+        """Count a step and return its inputs; without a gradient the tensor moves by its momentum alone."""
         group = self.param_groups[0]
         param, rate = group["params"][0], group["lr"] * scale.rate
         gradient = torch.zeros_like(param) if param.grad is None else param.grad.contiguous()

@@ -1,7 +1,7 @@
 """Step the tensors of a script's own `torch.optim.Adam` in one of our kernels each.
 
-PyTorch's fused Adam has such kernels, too. But one of its blocks takes 65,536 numbers, so that the positions of 200,000
-Gaussians keep a tenth of a GPU busy, and its Python takes as long as a small render.
+PyTorch's fused Adam has such kernels, too. But its blocks take so many numbers that a field's positions leave most of a
+GPU idle, and its Python takes as long as a small render.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 class TensorwiseAdam(torch.optim.Adam):
     """Step as `torch.optim.Adam` does, with its groups, state and hooks; results differ by rounding.
 
-    `fuse_steps` makes optimizers of this class. It has only what `torch.optim.Adam` has without options.
+    `fuse_steps` makes optimizers of this class. It supports none of the options of `torch.optim.Adam`.
     """
 
     @torch.optim.Optimizer.profile_hook_step
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Step all tensors that have a gradient; return what `closure`, which is called first, returns."""
+        """Step all tensors that have a gradient, after `closure`, whose result is returned."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -63,7 +63,7 @@ def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[s
 
 
 def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
-    """Let a plain Adam on a CUDA device step each tensor in one kernel instead of a dozen; leave others as they are."""
+    """Let a plain Adam on a CUDA device step each tensor in one kernel instead of a dozen; other optimizers stay."""
     if type(optimizer) is not torch.optim.Adam or not all(map(_is_plain, optimizer.param_groups)):
         return
     ours = triton_works()

@@ -13,12 +13,12 @@ from lapgs_plugin.errors import UserInputError
 DEFAULT_SSIM_WEIGHT = 0.2
 """Lambda of 3DGS's loss (1 - lambda) L1 + lambda (1 - SSIM)."""
 
+# SSIM of 3DGS: an 11x11 Gaussian window, and the stabilisers for a dynamic range of 1.
 SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-"""SSIM of 3DGS: an 11x11 Gaussian window, and the stabilisers for a dynamic range of 1."""
 _gauss = [math.exp(-(tap**2) / (2 * SSIM_SIGMA**2)) for tap in range(-SSIM_RADIUS, SSIM_RADIUS + 1)]
 SSIM_WINDOW = tuple(weight / math.fsum(_gauss) for weight in _gauss)
-"""The window along one side."""
+"""Weights of the window along one side."""
 
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+# Noise falls with the opacity as the sigmoid SHARPNESS (FAINT - opacity) (Kheradmand et al. 2024).
 SHARPNESS, FAINT = 100.0, 0.005
-"""Noise falls with the opacity as the sigmoid SHARPNESS (FAINT - opacity) (Kheradmand et al. 2024)."""
 
 
 def displacements(

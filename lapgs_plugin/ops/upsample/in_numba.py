@@ -33,8 +33,7 @@ from lapgs_plugin.jit.threads import parallel
 
 Integers = NDArray[np.int64]
 
-BEFORE, AFTER = 2, 3
-"""Number of coarse neighbours of i before and after it."""
+BEFORE, AFTER = 2, 3  # coarse neighbours of i
 NEIGHBOURS = BEFORE + 1 + AFTER
 
 _STRIP_ROWS = 32

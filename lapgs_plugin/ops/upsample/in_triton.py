@@ -18,8 +18,10 @@ from lapgs_plugin.ops.upsample import are_differentiated
 BLOCK = 128
 LEAST_ROWS = 8
 """Fewest rows of a program."""
-MOST_TAPS, MOST_TRANSPOSED = 5, 12
-"""Upper bounds: coarse samples in the sum of a fine one, and fine samples whose sums a coarse one is in."""
+MOST_TAPS = 5
+"""Most coarse samples in the sum of a fine one."""
+MOST_TRANSPOSED = 12
+"""Most fine samples whose sums a coarse one is in."""
 
 # Triton compiles a kernel again for integers that are 1 or multiples of 16. Without this it would do so for many image
 # sizes.
