@@ -72,7 +72,7 @@ class RunArchive(RunFiles):
         """
         assert not manifest.records, "a new run has no finished level"
         folder = Path(path)
-        Manifest.from_json(asdict(manifest))  # refuse now what could not be read after training
+        Manifest.from_json(asdict(manifest))  # refuse now a value that could not be read after training
         require_room(folder, overwrite, since)
         with one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -323,7 +323,7 @@ class RunArchive(RunFiles):
         return learned
 
     def _learned(self, level: int, name: str, kind: Any) -> Any:
-        """Read what a level learned of the training photos; None if it has no such file."""
+        """Read a file about the training photos that a level wrote; None if it has none."""
         path = next(filter(exists, (self._extended_path(level, name), self.path(f"level_{level}", name))), None)
         if path is None:
             return None

@@ -10,8 +10,10 @@ import torch
 
 from lapgs_plugin.errors import UserInputError
 
-WINDOWS, WINDOW_ITERATIONS = 5, 100
-"""Profiles of a stage, and the iterations in each: one interval of densification at its default, so that it counts."""
+WINDOWS = 5
+"""Profiles of a stage."""
+WINDOW_ITERATIONS = 100
+"""Iterations of a profile: one interval of densification at its default, so that each has one."""
 HOST_COPIES = ("Memcpy HtoD", "Memcpy DtoH")
 """Beginnings of the profiler's names of copies between host and device: copy engines make them beside kernels."""
 

@@ -38,7 +38,7 @@ DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISI
 GPU_LIMIT = 1 << 30
 """Most bytes of a stage's images that `choose_place` keeps on a GPU of any size."""
 GPU_SHARE = 0.1
-"""The same as a share of the GPU's memory: the rest is for Gaussians and what they need to be trained."""
+"""Largest share of the GPU's memory for these images; the rest is for Gaussians and their training."""
 
 EIGHT_BIT_TOLERANCE = 1e-6
 """Largest distance from k/255 of a value of an 8-bit image: a GPU multiplies by 1/255, which may be an ulp off."""
@@ -209,10 +209,7 @@ class ImageStore:
         return _decode(self._all_arrived(names), first)
 
     def get_stored(self, *names: str) -> Tensor:
-        """Return what `get` does, but float16, and levels k of k / 255 as uint8, as they are stored.
-
-        Their bytes are a half or a quarter of those that `get` returns.
-        """
+        """Like `get`, without conversion to float32: float16 stays, 8-bit images stay uint8 (k of k / 255)."""
         divisors = [self._images[name].divisor for name in names]
         as_stored = all(divisor is None or divisor is self._255 for divisor in divisors)
         return self._all_arrived(names) if as_stored else self.get(*names)
@@ -297,9 +294,9 @@ class ImageStore:
     def _finite_range(self, name: str, values: Tensor) -> tuple[float, float]:
         low, high = torch.stack(values.aminmax()).tolist()  # one wait for the GPU instead of two
         if not math.isfinite(low) or not math.isfinite(high):
-            what = "NaN, inf or values beyond 65504" if self._dtype == torch.float16 else "NaN or inf"
+            bad = "NaN, inf or values beyond 65504" if self._dtype == torch.float16 else "NaN or inf"
             raise TrainingDivergedError(
-                f"the image of view {name} holds {what}, expected finite values; the levels finished before are kept"
+                f"the image of view {name} holds {bad}, expected finite values; the levels finished before are kept"
             )
         return low, high
 

@@ -48,11 +48,12 @@ from lapgs_plugin.untrusted import TEXT_BYTES, read_json
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
+# Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
-"""Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning."""
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 FORGET_EXTENSION = "delete it to extend the run anew"
+"""Advice about a checkpoint of an interrupted extension."""
 EXTENDED = "extended_{}.{}"
 """A file of a run after its extension to a number of iterations, until it replaces the file of that name."""
 
@@ -106,8 +107,8 @@ def require_place(folder: Path, option: str = "--out") -> None:
             raise UserInputError(f"{option} {folder}: a name of more than {LONGEST_NAME} bytes; choose a shorter one")
         existing = os.path.dirname(existing) or os.curdir  # noqa: PTH120
     if not is_folder(Path(existing)):
-        what = "a file" if is_file(Path(existing)) else "no folder"  # such as a link that leads nowhere
-        raise UserInputError(f"{option} {folder}: {existing} is {what}; expected a folder, or a name for a new one")
+        kind = "a file" if is_file(Path(existing)) else "no folder"  # such as a link that leads nowhere
+        raise UserInputError(f"{option} {folder}: {existing} is {kind}; expected a folder, or a name for a new one")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise UserInputError(f"{option} {folder}: {existing} is not writable; choose another folder")
     new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
@@ -209,7 +210,7 @@ def remove_results(folder: Path) -> None:
 
 
 def remove_scratch(folder: Path) -> None:
-    """Remove what a killed run left: temporary files, cached predictions, an incomplete line of history."""
+    """Remove the scratch files of a killed run: temporary files, cached predictions, an incomplete line of history."""
     for pattern in (TEMPORARY_PATTERN, f"level_*/{TEMPORARY_PATTERN}"):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)

@@ -94,7 +94,7 @@ class LevelImages:
         pyramid: makes the images, on the stores' device.
         with_coarse: also store I^(l+1).
         masked: whether views have masks.
-        exact: keep the images as float32, for training on a CPU: in memory the tensors as they are.
+        exact: keep the images as float32, without encoding them, for training on a CPU.
 
     Attributes:
         targets: I^l.

@@ -220,7 +220,7 @@ class Manifest:
             levels: number of levels, 1 to 24.
             rasterizer: that renders the run best, as `--rasterizer` names it: "gsplat", "cpu", or the module of an
                 extension. Where it is not available, the most similar one renders.
-            hierarchy: what finer levels are, "laplacian" or "nested".
+            hierarchy: kind of the finer levels, "laplacian" or "nested".
             grid: of the loop's `Pyramid`, "camera" or "even".
             inherit: how residuals started, "geometry", "xyz" or "full".
             sh_degree: highest of the fields, 0 to 3.

@@ -1,7 +1,7 @@
-"""Predict what a run would have learned of held-out views from what it learned of the training views beside them.
+"""Predict exposure and pose corrections of held-out views from those of the training views beside them.
 
-In a video, or a walk around an object, exposure and errors of poses change slowly from view to view. Whether they do
-is found out among the training views: each is predicted by its two neighbours in the order of names, and by nothing.
+In a video, or a walk around an object, both change slowly from view to view. To test that, each training view is
+predicted by its two neighbours in the order of names; they are used if they predict better than the neutral value.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from torch import Tensor
 from lapgs_plugin.runs.archive import Exposures, Poses
 
 LARGEST_ERROR = 0.5
-"""Largest squared error of prediction among training views, as a share of that of the neutral value, for neighbours to
-be used."""
+"""Largest squared error of neighbours' predictions, as a share of the neutral value's, at which they are used."""
 
 
 def predicted_exposures(learned: Exposures, views: Iterable[str]) -> dict[str, Tensor]:
@@ -62,7 +61,7 @@ def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterabl
         views: names of views.
 
     Returns:
-        Empty if there are views that are not among the names, and neighbours tell nothing about those.
+        Empty if other views are wanted and neighbours do not predict them.
     """
     wanted, known = list(views), dict(zip(names, values, strict=True))
     if unknown := [name for name in wanted if name not in known]:

@@ -1,4 +1,4 @@
-"""Declare what a training run can measure about itself. Imports no torch."""
+"""Declare the measurements of a training run. Imports no torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PANEL = "Run"
 
 @dataclass(frozen=True)
 class MeasuringOptions:
-    """Choose what a run measures while it trains. None of it counts as training time."""
+    """Choose the measurements of a run in training. None of them counts as training time."""
 
     test_every: int | None = option(
         None,

@@ -178,7 +178,7 @@ class Breakdown:
             self._read()
 
     def _read(self) -> None:
-        """Add up the time between marks that were passed; the last one stays, as the begin of what follows."""
+        """Add up the time between marks that were passed; the last one stays and begins the next time."""
         while len(self._marks) > 1 and self._clock.passed(self._marks[1][1]):
             part, begin = self._marks.popleft()
             if part is not None:

@@ -13,7 +13,7 @@ from lapgs_plugin.runs.manifest import MemoryBytes
 from lapgs_plugin.untrusted import Strict, StrictWithMore, read_json
 
 MEASURED = {"test": "held-out", "train": "training", "other": "another scene's"}
-"""What the measured views of `Metrics` are called, by their "split"."""
+"""Names of the measured views of `Metrics`, by their "split"."""
 
 
 class HistoryEntry(StrictWithMore):

@@ -1,4 +1,4 @@
-"""Write and read what a run folder has beside its levels: manifest, history, figures, checkpoint."""
+"""Write and read the files of a run folder beside its levels: manifest, history, figures, checkpoint."""
 
 from __future__ import annotations
 

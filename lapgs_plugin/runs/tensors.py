@@ -35,11 +35,11 @@ def write_tensors(path: Path, state: dict[str, Any]) -> None:
 
 
 def read_tensors(path: Path, advice: str) -> dict[str, Any]:
-    """Read what `write_tensors` wrote, with tensors on the CPU.
+    """Read a file of `write_tensors`, with tensors on the CPU.
 
     Args:
         path: of the file.
-        advice: what a user can do if it is damaged; ends the message.
+        advice: next step of a user if it is damaged; ends the message.
 
     Raises:
         RunFolderError: it cannot be read, or its tensors would take more memory than the file has bytes.

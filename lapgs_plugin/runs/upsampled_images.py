@@ -45,7 +45,7 @@ class UpsampledImages:
 
     @property
     def where(self) -> str:
-        """Where the images wait, as `ImageStore.where`."""
+        """As `ImageStore.where`."""
         return self.store.where
 
     def prefetch(self, name: str) -> None:
@@ -58,9 +58,9 @@ class UpsampledImages:
         return upsample(self.pyramid, self.store.get(*names), self._sizes[names[0]])
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return what adds Up of the images of some views, of one size, to (c, h, w) or for several (b, c, h, w).
+        """Return a function that adds Up of the images of some views of one size to (c, h, w), or to (b, c, h, w).
 
-        Until then they are as small as they are stored.
+        The images stay at half size until it is called.
         """
         stored = self.store.get_stored(*names)
         if stored.dtype == torch.uint8:
