@@ -59,12 +59,7 @@ def is_video(out: Path) -> bool:
 
 
 def clip_size(camera: Camera, wanted: tuple[int, int] | None, out: Path) -> tuple[int, int]:
-    """Return width and height of each view of a clip.
-
-    Args:
-        camera: of the path.
-        wanted: requested size, None for the camera's own, which is rounded down to even sides for a video.
-        out: video or folder.
+    """Return width and height of each view of a clip: as wanted, or the camera's, rounded down to even for a video.
 
     Raises:
         UserInputError: a video of an odd size was requested.
@@ -93,8 +88,6 @@ def render_clip(
     """Render a path to a file or a folder.
 
     Args:
-        renderer: of the run.
-        cameras: one per frame.
         out: an .mp4 file, or a folder for frame_00000.png and so on.
         level: finest level to add; the image is upsampled to full size.
         size: (width, height) of a view.
@@ -137,11 +130,6 @@ def _panels(renderer: HierarchyRenderer, camera: Camera, level: int, raw: bool) 
 @contextmanager
 def _video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[FrameSink]:
     """Write an H.264 video (yuv420p), which every player supports; the file appears when it is complete.
-
-    Args:
-        path: an .mp4 file; missing folders are created.
-        size: (width, height) of every frame, both even.
-        fps: frames a second.
 
     Raises:
         LapgsError: the file cannot be written.

@@ -55,9 +55,9 @@ class FieldOffload:
 class FieldRenderer:
     """Render each level's field by itself, at its level's size.
 
-    For one camera and an image of at most `stack_pixels`, a rasterizer that can renders all fields in one set of
-    launches: launching is then what takes the time. Otherwise a GPU renders every field in a stream of its own, so that
-    a coarse level, which leaves most of the GPU idle, costs little beside a fine one. Nothing here waits for the GPU,
+    For one camera and an image of at most `stack_pixels`, launching takes most of the time: a rasterizer that can
+    renders all fields in one set of launches. Otherwise a GPU renders every field in a stream of its own, so that a
+    coarse level, which leaves most of the GPU idle, costs little beside a fine one. Nothing here waits for the GPU,
     except for a field that has to be copied there first.
 
     Attributes:

@@ -221,7 +221,7 @@ class HierarchyRenderer(FieldRenderer):
 
     @torch.no_grad()
     def band(self, camera: Camera, level: int, gain: float = 1.0) -> Tensor:
-        """Return what one level adds to the coarser ones, (3, h, w) at its size; for the coarsest, its image.
+        """Return one level's part of the image, (3, h, w) at its size: a residual, or the coarsest level's image.
 
         Args:
             camera: of the full-resolution view.

@@ -1,4 +1,4 @@
-"""Declare where a run's scene is, and where and with what the run is rendered. Imports no torch."""
+"""Declare the scene, device and rasterizer with which a run is rendered. Imports no torch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lapgs_plugin.options import option
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Choose where a run's scene is, and where and with which rasterizer the run is rendered."""
+    """Choose the scene folder, device and rasterizer with which a run is rendered."""
 
     scene: Path | None = option(
         None, "Scene folder, if it was moved after training, or a scene of other photos in the same coordinates."

@@ -21,7 +21,7 @@ NO_LENGTH = 1e-9
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene and their common geometry.
+    """Hold the cameras of a scene and their common geometry.
 
     Attributes:
         cameras: at least one.

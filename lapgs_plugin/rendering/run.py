@@ -31,12 +31,7 @@ PATHS = ("orbit", "spline")
 def run_renderer(
     archive: RunArchive, device: str = "auto", rasterizer: str = "auto", *, finest: int = 0
 ) -> HierarchyRenderer:
-    """Return a renderer of a run's finished levels.
-
-    Args:
-        archive: the run.
-        device, rasterizer: as `rasterizer_for` takes them.
-        finest: the finest level to read.
+    """Return a renderer of a run's finished levels down to `finest`; device and rasterizer as `rasterizer_for`.
 
     Raises:
         RunFolderError: no level is finished, or a field is damaged.
@@ -66,7 +61,6 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
     """Load the scene of a run with the settings of the training. Its images are read when they are used.
 
     Args:
-        archive: the run.
         moved_to: current folder of the scene; None if it is where the manifest says.
 
     Raises:
@@ -92,12 +86,7 @@ def _errors_about_scene(archive: RunArchive, moved_to: Path | None) -> AbstractC
 
 
 def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
-    """Return whether a scene has none of the photos that a run was trained on; False if these are not there any more.
-
-    Args:
-        archive: the run.
-        scene: as `run_scene` returned it.
-    """
+    """Return whether a scene has none of the photos that a run was trained on; False if those are missing now."""
     try:
         trained, held_out = run_cameras(archive)
     except (RunFolderError, SceneError):
@@ -181,12 +170,7 @@ def _scene_folder(archive: RunArchive, moved_to: Path | None) -> tuple[SceneRefe
 
 
 def require_same_scene(archive: RunArchive, path: Path, smallest: tuple[int, int]) -> None:
-    """Check that a scene's images have the size that was trained, because metrics would be wrong otherwise.
-
-    Args:
-        archive: the run.
-        path: of the scene, for the message.
-        smallest: its `Scene.smallest_size`.
+    """Check that a scene's images, of `Scene.smallest_size`, have the size that was trained; else metrics are wrong.
 
     Raises:
         RunFolderError: a finished level had another size.

@@ -52,9 +52,7 @@ def measure_speed(
     Images are composed and clamped, and stay on the device. Each kind is run over all cameras once before it is timed.
 
     Args:
-        renderer: of the run.
         cameras: of full-resolution views, at least one.
-        level: the finest to add.
         rounds: over all cameras.
     """
     one_size = len({camera.size for camera in cameras}) == 1
