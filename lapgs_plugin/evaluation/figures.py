@@ -62,8 +62,10 @@ OF_LEVELS = (
 )
 """Figures of a level that are those of its record."""
 
-FPS_VIEWS, FPS_ROUNDS = 16, 3
-"""Views and repetitions of each over which frames a second are measured, at most."""
+FPS_VIEWS = 16
+"""Most views over which frames a second are measured."""
+FPS_ROUNDS = 3
+"""Repetitions of each of these views."""
 
 
 def evaluate_run(
@@ -75,8 +77,6 @@ def evaluate_run(
     run's metrics.json.
 
     Args:
-        archive: the run.
-        options: where the scene is, and what renders the run.
         lpips: distances to measure, those of VGG by default. Distances without weights are left out, and
             "lpips_missing" says so.
 
@@ -136,7 +136,7 @@ def _measure_view(
     """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device.
 
     Args:
-        exposure: (3, 4) colour transform from renders to this photo; None for renders as they are.
+        exposure: (3, 4) colour transform from renders to this photo; None without one.
 
     Returns:
         The view's entry of "views", and by level what it adds to "levels".
@@ -172,11 +172,7 @@ def _measure_view(
 
 
 def run_metrics(archive: RunArchive, options: RenderOptions | None) -> dict[str, Any]:
-    """Return the run's metrics.json, or measure it with `evaluate_run` when it does not exist.
-
-    Args:
-        archive: the run.
-        options: of the measurement; None refuses a run without metrics.json.
+    """Return the run's metrics.json; if it does not exist, measure the run unless `options` is None.
 
     Raises:
         RunFolderError: see `evaluate_run`; another program wrote the file; or it does not exist and `options` is None.

@@ -21,8 +21,10 @@ from torch import Tensor, nn
 
 from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
 
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Mean and deviation by which LPIPS normalizes each channel of an image in [-1, 1]."""
+SHIFT = -0.030, -0.088, -0.188
+"""Mean of each channel, by which LPIPS normalizes an image in [-1, 1]."""
+SCALE = 0.458, 0.448, 0.450
+"""Deviation of each channel."""
 EPSILON = 1e-8
 """Added to the squared lengths of feature vectors, as in torchmetrics; lpips adds 1e-10 to the length."""
 DOWNLOADS = "https://download.pytorch.org/models/"
@@ -82,7 +84,7 @@ def _squeezenet() -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class Network:
-    """A network whose features LPIPS compares.
+    """Describe a network whose features LPIPS compares.
 
     Attributes:
         title: its name in tables.
@@ -141,7 +143,7 @@ def lpips_titles(keys: Container[str]) -> dict[str, str]:
 
 
 class Lpips(nn.Module):
-    """The LPIPS distance of two images under one network.
+    """Measure the LPIPS distance of two images under one network.
 
     Args:
         name: key in `NETWORKS`.
@@ -199,7 +201,7 @@ class Lpips(nn.Module):
 
 @dataclass(frozen=True)
 class LpipsMetrics:
-    """The loaded networks, and the distances to measure of every view.
+    """Hold the loaded networks, and the distances to measure of every view.
 
     Attributes:
         networks: by key in `NETWORKS`, those with weights.
@@ -224,7 +226,7 @@ def missing_lines(missing: Mapping[str, str]) -> list[str]:
 
 @dataclass(frozen=True)
 class LpipsRequest:
-    """The distances that a user asks for.
+    """Choose the distances to measure.
 
     Attributes:
         variants: of `VARIANTS`; None for those of the files' networks, or of VGG without files.
@@ -259,9 +261,7 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
     """Load the networks of a request whose weights can be found.
 
     Args:
-        request: the distances to measure.
         smallest_side: of the images, in pixels.
-        device: of the images.
 
     Raises:
         UserInputError: a named file cannot be read, or belongs to no known network.

@@ -14,9 +14,10 @@ from lapgs_plugin.ops.photometric_loss import in_torch
 
 LITTLE = 1e-6
 """Weight of the identity in a colour fit, relative to that of the pixels."""
-FAR_WORSE, SPREADS = 6.0, 4.5
-"""Fewest dB below the median at which an image is far worse than the rest: twice the error; and as a multiple of the
-median distance of the better half from the median: three standard deviations of a normal distribution."""
+FAR_WORSE = 6.0
+"""Fewest dB below the median at which an image is far worse than the rest: twice the error."""
+SPREADS = 4.5
+"""The same as a multiple of the better half's median distance from the median: three deviations of a normal one."""
 SMALLEST_MSE = 1e-10
 """Smallest mean squared error that counts, near the resolution of float32 images; it bounds PSNR."""
 
@@ -66,7 +67,7 @@ def color_fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None)
 def fit_colors(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the transform (3, 4) for which A rgb + b is closest to the target, in least squares.
 
-    A tiny weight of the identity decides what the pixels leave open, such as all of it for an image of one colour.
+    A tiny weight of the identity decides where the pixels leave the transform open, as in an image of one colour.
 
     Args:
         image, target: (3, h, w), clamped to [0, 1] here.

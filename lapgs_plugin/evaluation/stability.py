@@ -43,7 +43,7 @@ COMPOSITION, SINGLE = "composition", "single field"
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Depth of a view.
+    """Hold the depth of a view.
 
     Attributes:
         depth: (h, w) along the optical axis, in world units: the mean depth of the Gaussians with their blending
@@ -61,26 +61,14 @@ class DepthImage:
 
 @torch.no_grad()
 def render_depth(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> DepthImage:
-    """Render the depth of a field from a camera, by rendering depths as colours.
-
-    Args:
-        rasterizer: any.
-        field: ordinary or a base; a residual has no depth.
-        camera: on the field's device or the CPU.
-    """
+    """Render the depth of an ordinary field or a base; a residual has none. Depths are rendered as colours."""
     weighted, cover = render_depths(rasterizer, field, camera)
     return DepthImage(weighted / cover.clamp(min=SMALLEST_COVER), cover)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered frame of a path.
-
-    Attributes:
-        camera: of the frame.
-        depth: of its pixels.
-        images: by name, (3, h, w).
-    """
+    """Hold a frame of a path: its camera, the depth of its pixels, and images (3, h, w) by name."""
 
     camera: Camera
     depth: DepthImage
@@ -89,7 +77,7 @@ class Frame:
 
 @dataclass
 class Flicker:
-    """Accumulated differences between frames and their predecessors, over all pixels that both show.
+    """Add up differences between frames and their predecessors, over all pixels that both show.
 
     Attributes:
         absolute, squared: sums over pixels and channels.
@@ -198,11 +186,9 @@ def evaluate_stability(
     """Measure the flicker of a run along a path, and write it to the run's stability.json.
 
     Args:
-        archive: the run.
         single: a single field of the same scene, or None.
         path: name of the path in the figures.
         cameras: one for each frame.
-        options: what renders the runs.
 
     Returns:
         JSON values: "path", "size", "frames", "compared" (share of all pixels), "baseline", and in "flicker", by image,
