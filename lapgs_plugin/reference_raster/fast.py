@@ -128,13 +128,20 @@ class _Rasterize(torch.autograd.Function):
         if grad_image is None:
             grad_image = np.zeros_like(rendering.image)
         gaussians = _gaussians(ctx.saved_tensors, call.signed, call.sh_degree)
-        found = pipeline.gradients(gaussians, call.view, rendering, grad_image, grad_transmittance)
-        np.copyto(call.absgrad2d.numpy(), found.absolute_centres)
+        gradients = pipeline.gradients(gaussians, call.view, rendering, grad_image, grad_transmittance)
+        np.copyto(call.absgrad2d.numpy(), gradients.absolute_centres)
         by_background = None
         if ctx.needs_input_grad[1]:
             weights = rendering.transmittance.reshape(-1)
             by_background = torch.from_numpy(grad_image.reshape(3, -1) @ weights)
-        arrays = (found.centres, found.means, found.quats, found.scales, found.opacities, found.sh)
+        arrays = (
+            gradients.centres,
+            gradients.means,
+            gradients.quats,
+            gradients.scales,
+            gradients.opacities,
+            gradients.sh,
+        )
         return None, by_background, *(None if a is None else torch.from_numpy(a) for a in arrays)
 
 

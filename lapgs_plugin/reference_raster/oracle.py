@@ -183,7 +183,7 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return the matrices (n, 3, 3) of quaternions (n, 4), wxyz, as they are: rotations if their length is 1."""
+    """Return the matrices (n, 3, 3) of quaternions (n, 4), wxyz, not normalised: rotations if their length is 1."""
     w, x, y, z = quaternions.unbind(-1)  # (n,) each
     return torch.stack(
         [

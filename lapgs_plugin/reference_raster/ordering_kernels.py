@@ -157,8 +157,8 @@ def list_by_tile(
             left, top, right, bottom = _box(boxes, i)
             for y in range(top, bottom):
                 for x in range(left, right):
-                    place = row[y * tiles_x + x]
-                    row[y * tiles_x + x] = place + 1
-                    members[place] = i
-                    places[pair] = place
+                    position = row[y * tiles_x + x]
+                    row[y * tiles_x + x] = position + 1
+                    members[position] = i
+                    places[pair] = position
                     pair += 1

@@ -53,7 +53,7 @@ class Gaussians:
         sh: (n, k, 3) spherical-harmonic coefficients, k of 1, 4, 9, 16; or None if there are colours.
         colors: (n, 3) colours, or None if there are coefficients.
         raw: True for logarithms, logits and quaternions of any length; False for activated values.
-        signed: True if the colour is the SH value itself, False for max(value + 0.5, 0). `colors` are used as they are.
+        signed: True if the colour is the SH value itself, False for max(value + 0.5, 0). `colors` are not mapped.
         sh_degree: highest degree evaluated, not more than k has.
     """
 
@@ -145,7 +145,7 @@ def render(
 
     Args:
         background: (3,) in the Gaussians' float type.
-        keep: whether to keep what `gradients` needs.
+        keep: whether to keep the inputs of `gradients`.
         assign: from the splats and the radii, which it may change, to the tiles' lists. None takes the tiles of the
             three-sigma rectangle, as all rasterizers but FastGS do.
     """

@@ -1,7 +1,7 @@
 """Project Gaussians to splats on the image, and take gradients back.
 
 Sixteen Gaussians are processed at once, one in each lane. Kernels take the parameters that training optimizes ("raw")
-or activated ones: standard deviations, opacities in [0, 1] and quaternions used as they are, as CUDA rasterizers do.
+or activated ones: standard deviations, opacities in [0, 1] and quaternions that are not normalised.
 
 The 2D covariance is M M^T + 0.3 I with the 2x3 matrix M = J W R S. Its determinant is a sum of squares of the 2x2
 minors of M. The usual difference of products would lose all digits of an elongated Gaussian in float32.
@@ -95,8 +95,8 @@ from lapgs_plugin.reference_raster.sh_kernels import (
 
 HUGE = 1e37
 """Gaussians with a determinant in px^4 or a coordinate in px from here on are culled as overflown."""
+# Margins against rounding for the ellipse of alpha 1/255; only speed depends on their size.
 REACH_SLACK, REACH_SLOPE = 1e-3, 1e-5
-"""Margins against rounding for the ellipse of alpha 1/255; only speed depends on their size."""
 MIN_NORM = 1e-12
 """Shorter quaternions are divided by this instead of their length, as in torch.nn.functional.normalize."""
 AHEAD = 64
@@ -542,9 +542,9 @@ def _sum_slots(
         if first + lane < n:
             start, end = first_pair[first + lane], first_pair[first + lane + 1]
             pairs[lane] = end - start
-            for place in range(start, end):
-                prefetch(slots, places[min(place + AHEAD, last_place)] * SLOT)
-                total = total + load(slots, places[place] * SLOT)
+            for pair in range(start, end):
+                prefetch(slots, places[min(pair + AHEAD, last_place)] * SLOT)
+                total = total + load(slots, places[pair] * SLOT)
         store(sums, lane * SLOT, total)
 
 

@@ -114,7 +114,7 @@ def threshold_mask(
     """Find the pixels and Gaussians whose rendering depends on rounding.
 
     Args:
-        field: n Gaussians, exactly as they are rendered.
+        field: n Gaussians, the same bits as rendered.
         camera: the view.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.

@@ -196,9 +196,9 @@ def blend(
         if keep:
             reached[tile] = batch - start
             for block in range(BLOCKS):
-                place = tile * FINAL + 2 * block * WIDTH
-                store(final, place, absolute(load(state, (_FORWARD * block + _T) * WIDTH)))
-                store(final, place + WIDTH, load(state, (_FORWARD * block + _LAST) * WIDTH))
+                base = tile * FINAL + 2 * block * WIDTH
+                store(final, base, absolute(load(state, (_FORWARD * block + _T) * WIDTH)))
+                store(final, base + WIDTH, load(state, (_FORWARD * block + _LAST) * WIDTH))
         _close_tile(state, background, tile_x, tile_y, width, height, image, transmittance)
     keep_alive(scratch)
     keep_alive(integers)
@@ -252,10 +252,10 @@ def _blend_block(
     Returns:
         The number of splats processed when all pixels were opaque, or -1 if some are not.
     """
-    place = _FORWARD * block * WIDTH
-    t, last = load(state, place + _T * WIDTH), load(state, place + _LAST * WIDTH)
+    base = _FORWARD * block * WIDTH
+    t, last = load(state, base + _T * WIDTH), load(state, base + _LAST * WIDTH)
     red, green, blue = (
-        load(state, place + _R * WIDTH), load(state, place + _G * WIDTH), load(state, place + _B * WIDTH)
+        load(state, base + _R * WIDTH), load(state, base + _G * WIDTH), load(state, base + _B * WIDTH)
     )  # fmt: skip
     x, y = pixels_x(offsets, block, tile_x), pixels_y(offsets, block, tile_y)
     done = -1
@@ -277,11 +277,11 @@ def _blend_block(
         if not any_lane(t > 0.0):
             done = j + 1
             break
-    store(state, place + _T * WIDTH, t)
-    store(state, place + _R * WIDTH, red)
-    store(state, place + _G * WIDTH, green)
-    store(state, place + _B * WIDTH, blue)
-    store(state, place + _LAST * WIDTH, last)
+    store(state, base + _T * WIDTH, t)
+    store(state, base + _R * WIDTH, red)
+    store(state, base + _G * WIDTH, green)
+    store(state, base + _B * WIDTH, blue)
+    store(state, base + _LAST * WIDTH, last)
     return done
 
 
@@ -293,19 +293,19 @@ def _close_tile(
     """Blend the background and store the pixels that are inside of the image."""
     pixels = width * height
     for block in range(BLOCKS):
-        place = _FORWARD * block * WIDTH
-        t = absolute(load(state, place + _T * WIDTH))
-        store(state, place + _T * WIDTH, t)
+        base = _FORWARD * block * WIDTH
+        t = absolute(load(state, base + _T * WIDTH))
+        store(state, base + _T * WIDTH, t)
         for channel in range(3):
-            color = load(state, place + (_R + channel) * WIDTH)
-            store(state, place + (_R + channel) * WIDTH, fma(t, background[channel], color))
+            color = load(state, base + (_R + channel) * WIDTH)
+            store(state, base + (_R + channel) * WIDTH, fma(t, background[channel], color))
         block_y, block_x = divmod(block, TILE // BLOCK)
         first_x = tile_x * TILE + block_x * BLOCK
         first_y = tile_y * TILE + block_y * BLOCK
         for row in range(min(BLOCK, height - first_y)):
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
-                lane = place + row * BLOCK + column
+                lane = base + row * BLOCK + column
                 transmittance[pixel] = state[lane + _T * WIDTH]
                 image[pixel] = state[lane + _R * WIDTH]
                 image[pixels + pixel] = state[lane + _G * WIDTH]
@@ -372,28 +372,28 @@ def _reopen_tile(
     """Set the state behind the last splat; pixels outside of the image have no gradient."""
     pixels = width * height
     for block in range(BLOCKS):
-        place = _BACKWARD * block * WIDTH
+        base = _BACKWARD * block * WIDTH
         for quantity in range(_REST, _FINAL):
-            store(state, place + quantity * WIDTH, splat(state, 0.0))
+            store(state, base + quantity * WIDTH, splat(state, 0.0))
         block_y, block_x = divmod(block, TILE // BLOCK)
         first_x = tile_x * TILE + block_x * BLOCK
         first_y = tile_y * TILE + block_y * BLOCK
         for row in range(min(BLOCK, height - first_y)):
             for column in range(min(BLOCK, width - first_x)):
                 pixel = (first_y + row) * width + first_x + column
-                lane = place + row * BLOCK + column
+                lane = base + row * BLOCK + column
                 state[lane + _GRAD_R * WIDTH] = grad_image[pixel]
                 state[lane + _GRAD_G * WIDTH] = grad_image[pixels + pixel]
                 state[lane + _GRAD_B * WIDTH] = grad_image[2 * pixels + pixel]
                 if by_transmittance:
                     state[lane + _REST * WIDTH] = grad_transmittance[pixel]
         t = load(final, tile * FINAL + 2 * block * WIDTH)
-        rest = load(state, place + _REST * WIDTH)
+        rest = load(state, base + _REST * WIDTH)
         for channel in range(3):
-            rest = fma(load(state, place + (_GRAD_R + channel) * WIDTH), background[channel], rest)
-        store(state, place + _T_BEHIND * WIDTH, t)
-        store(state, place + _REST * WIDTH, t * rest)
-        store(state, place + _FINAL * WIDTH, load(final, tile * FINAL + (2 * block + 1) * WIDTH))
+            rest = fma(load(state, base + (_GRAD_R + channel) * WIDTH), background[channel], rest)
+        store(state, base + _T_BEHIND * WIDTH, t)
+        store(state, base + _REST * WIDTH, t * rest)
+        store(state, base + _FINAL * WIDTH, load(final, tile * FINAL + (2 * block + 1) * WIDTH))
 
 
 @inline
@@ -417,7 +417,7 @@ def _splat_backward(
     while blocks != 0:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
-        place = _BACKWARD * block * WIDTH
+        base = _BACKWARD * block * WIDTH
         # As `falloff`, with xy and yy in registers. The others are loaded again in each block; they would be spilled.
         dx = pixels_x(offsets, block, tile_x) - splats[s + CENTRE_X]
         dy = pixels_y(offsets, block, tile_y) - splats[s + CENTRE_Y]
@@ -426,20 +426,20 @@ def _splat_backward(
         exponent = fma(-u, u, fma(-v, v, splats[s + LOG2_OPACITY]))
         density = exp2(exponent)
         alpha = minimum(density, MAX_ALPHA)
-        blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, place + _FINAL * WIDTH) >= position)
-        t, rest = load(state, place + _T_BEHIND * WIDTH), load(state, place + _REST * WIDTH)
+        blended = (exponent >= LOG2_MIN_ALPHA) & (load(state, base + _FINAL * WIDTH) >= position)
+        t, rest = load(state, base + _T_BEHIND * WIDTH), load(state, base + _REST * WIDTH)
         grad_red, grad_green, grad_blue = (
-            load(state, place + _GRAD_R * WIDTH),
-            load(state, place + _GRAD_G * WIDTH),
-            load(state, place + _GRAD_B * WIDTH),
+            load(state, base + _GRAD_R * WIDTH),
+            load(state, base + _GRAD_G * WIDTH),
+            load(state, base + _GRAD_B * WIDTH),
         )
         inverse = select(blended, 1.0 / (1.0 - alpha), 1.0)
         in_front = t * inverse
         shade = grad_blue * splats[s + BLUE]
         shade = fma(grad_red, splats[s + RED], fma(grad_green, splats[s + GREEN], shade))
         weight = select(blended, alpha * in_front, 0.0)
-        store(state, place + _T_BEHIND * WIDTH, in_front)
-        store(state, place + _REST * WIDTH, fma(weight, shade, rest))
+        store(state, base + _T_BEHIND * WIDTH, in_front)
+        store(state, base + _REST * WIDTH, fma(weight, shade, rest))
         # The cap at 0.99 passes the gradient as if it were not there, as the CUDA code does.
         d = select(blended, density * (fma(t, shade, -rest) * inverse), 0.0)
         d_u, d_v = d * u, d * v
