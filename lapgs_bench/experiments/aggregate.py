@@ -27,15 +27,14 @@ TIMES = ("minutes", "train_seconds", "iteration_ms")
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """Describe a column of a table.
 
     Attributes:
-        heading: heading as in the paper, without arrow.
+        heading: as in the paper, without arrow.
         better: "lower", "higher" or "".
         sources: columns of the rows; the first that a row has is used. A source that ends with "_level_" stands for one
             column for each level.
         scale: factor on the value.
-        decimals: digits after the point.
     """
 
     heading: str
@@ -85,13 +84,11 @@ COLUMNS: Mapping[str, Column] = {
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure of a row.
+    """Hold a figure of a row, and that of the paper.
 
     Attributes:
         values: the mean, or one for each level, coarsest first; empty without measurements.
-        deviation: deviation over seeds of the sum over levels; None with one seed.
-        seeds: number of seeds.
-        paper: the figure in the paper, or None.
+        deviation: over seeds, of the sum over levels; None with one seed.
     """
 
     values: tuple[float, ...] = ()
@@ -107,7 +104,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A row relative to its baseline, measured and in the paper; None without a comparison."""
+    """Compare a row with its baseline, as measured and in the paper; None without a comparison."""
 
     measured: float | None
     paper: float | None
@@ -115,15 +112,13 @@ class Ratio:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A variant on a backbone.
+    """Hold the figures of a variant on a backbone.
 
     Attributes:
-        label: its name.
         section: heading above it, "" without one.
-        cells: cells by column.
+        cells: by column.
         speedup: time of the baseline divided by its own.
         psnr_gain: its PSNR minus the baseline's, in dB.
-        is_baseline: whether other rows are compared with it.
     """
 
     label: str
@@ -136,13 +131,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Group:
-    """The part of a table for one data set or one scene.
-
-    Attributes:
-        title: its title.
-        rows: rows in the experiment's order.
-        notes: remarks for readers, as sentences.
-    """
+    """Hold the part of a table for one data set or one scene: rows in the experiment's order, remarks as sentences."""
 
     title: str
     rows: tuple[TableRow, ...]
@@ -151,13 +140,12 @@ class Group:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """A table of results, to be written as Markdown and LaTeX.
+    """Hold a table of results, to be written as Markdown and LaTeX.
 
     Attributes:
-        experiment: the experiment, whose `table` says how the results are shown.
         measured: machines, versions and numbers of iterations.
         groups: data sets in the experiment's order.
-        scenes: scenes, if the experiment asks for them.
+        scenes: single scenes, if the experiment asks for them.
     """
 
     experiment: Experiment
@@ -218,21 +206,21 @@ def make_table(experiment: Experiment, planned: Sequence[PlannedRun], records: M
 
 def _measured(planned: Sequence[PlannedRun], records: Mapping[str, Row]) -> str:
     """Describe where the runs were measured."""
-    found = [(run.spec, records[run.spec.run_id]) for run in planned if run.spec.run_id in records]
-    if not found:
+    finished = [(run.spec, records[run.spec.run_id]) for run in planned if run.spec.run_id in records]
+    if not finished:
         return "nothing yet"
-    iterations = sorted({spec.iterations for spec, _ in found})
+    iterations = sorted({spec.iterations for spec, _ in finished})
     parts = [f"{' and '.join(f'{count:,}' for count in iterations)} iterations"]
-    machines = sorted({str(row.get("gpu") or row.get("processor") or "an unknown machine") for _, row in found})
+    machines = sorted({str(row.get("gpu") or row.get("processor") or "an unknown machine") for _, row in finished})
     parts.append(" and ".join(machines))
     for words, name in (("torch", "torch"), ("lapgs_plugin", "lapgs_version"), ("images measured by", "measured_by")):
-        if values := sorted({str(row[name]) for _, row in found if row.get(name)}):
+        if values := sorted({str(row[name]) for _, row in finished if row.get(name)}):
             parts.append(f"{words} {' and '.join(values)}")
     return ", ".join(parts)
 
 
 class _GroupBuilder:
-    """Builds one group of a table, of runs that share their data set, from the rows of all finished runs."""
+    """Build one group of a table, of runs that share their data set, from the rows of all finished runs."""
 
     def __init__(
         self, experiment: Experiment, paper: PaperTable | None, runs: Sequence[PlannedRun], records: Mapping[str, Row]
@@ -243,15 +231,17 @@ class _GroupBuilder:
         pairs = [(backbone, variant) for variant in self._variants for backbone in experiment.backbones]
         self._keys: list[RowKey] = [pair for pair in pairs if pair in asked]
         self._scenes = list(dict.fromkeys(run.spec.scene for run in runs))
-        self._found: dict[RowKey, dict[int, dict[str, Row]]] = {key: defaultdict(dict) for key in self._keys}
+        self._rows: dict[RowKey, dict[int, dict[str, Row]]] = {key: defaultdict(dict) for key in self._keys}
         for run in runs:
             if (record := records.get(run.spec.run_id)) is not None:
-                self._found[run.spec.backbone, run.variant][run.spec.seed][run.spec.scene] = record
+                self._rows[run.spec.backbone, run.variant][run.spec.seed][run.spec.scene] = record
         self._missing = sum(run.spec.run_id not in records for run in runs)
         self._total = len(runs)
-        measured = [found for found in self._found.values() if found]
+        measured = [by_seed for by_seed in self._rows.values() if by_seed]
         self._common = [
-            scene for scene in self._scenes if all(any(scene in one for one in found.values()) for found in measured)
+            scene
+            for scene in self._scenes
+            if all(any(scene in rows for rows in by_seed.values()) for by_seed in measured)
         ]
 
     def group(self, title: str | None = None) -> Group:
@@ -268,9 +258,7 @@ class _GroupBuilder:
 
     def _cells(self, key: RowKey) -> dict[str, Cell]:
         # Only seeds that have all compared scenes.
-        complete = [
-            [one[s] for s in self._common] for one in self._found[key].values() if {*self._common} <= one.keys()
-        ]
+        complete = [[one[s] for s in self._common] for one in self._rows[key].values() if {*self._common} <= one.keys()]
         rows = complete if self._common else []
         return {
             name: _cell(rows, COLUMNS[name], self._paper_figure(key, name)) for name in self._experiment.table.columns

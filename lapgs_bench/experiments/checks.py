@@ -53,11 +53,8 @@ def check_runs(
     """Collect the mistakes in these runs.
 
     Args:
-        planned: the runs.
-        jobs: their commands.
         scenes: the scenes that exist or will be made, with their folders, by name.
-        mistakes: receives the mistakes.
-        here: whether the runs are for this machine; if so, what it lacks is a mistake.
+        here: whether the runs are for this machine; if so, a missing package or device is a mistake.
     """
     by_id = {job.run_id: job for job in jobs}
     sizes = {name: cache(partial(_smallest_size, *scene)) for name, scene in scenes.items()}

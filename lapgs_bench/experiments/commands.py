@@ -33,12 +33,7 @@ ON_BY_DEFAULT = ("dry-run", "fused-adam", "fused-ssim", "prune-by-size", "run-ah
 
 @dataclass(frozen=True)
 class Step:
-    """One command of a run.
-
-    Attributes:
-        command: with its arguments.
-        cwd: working directory.
-    """
+    """Hold one command of a run, with its arguments, and its working directory."""
 
     __pydantic_config__: ClassVar[Any] = STRICT
 
@@ -47,15 +42,15 @@ class Step:
 
 
 class Locations:
-    """Folders of scenes, data sets and checkouts.
+    """Find folders of scenes, data sets and checkouts.
 
     Args:
-        given: folders by name, from --path.
-        base: base of relative paths in the experiment file.
+        folders: by name, from --path.
+        base: of relative paths in the experiment file.
     """
 
-    def __init__(self, given: Mapping[str, Path], base: Path) -> None:
-        self._given, self._base = given, base
+    def __init__(self, folders: Mapping[str, Path], base: Path) -> None:
+        self._folders, self._base = folders, base
 
     def scene(self, scene: SceneSpec) -> Path:
         """Find the folder of a scene.
@@ -93,15 +88,15 @@ class Locations:
 
     def _find(self, name: str) -> Path | None:
         variable = os.environ.get(_environment_variable(name))
-        return self._given.get(name, None if variable is None else Path(variable))
+        return self._folders.get(name, None if variable is None else Path(variable))
 
     @staticmethod
-    def _require_folder(what: str, folder: Path | None, names: Iterable[str]) -> Path:
-        ways = " or ".join(f"--path {name}=FOLDER ({_environment_variable(name)})" for name in names)
+    def _require_folder(name: str, folder: Path | None, keys: Iterable[str]) -> Path:
+        ways = " or ".join(f"--path {key}=FOLDER ({_environment_variable(key)})" for key in keys)
         if folder is None:
-            raise UserInputError(f"{what}: its folder is not given; give {ways}")
+            raise UserInputError(f"{name}: its folder is not given; give {ways}")
         if not is_folder(folder):
-            raise UserInputError(f"{what}: {folder} is not a folder; give {ways}")
+            raise UserInputError(f"{name}: {folder} is not a folder; give {ways}")
         return folder.absolute()
 
 
@@ -116,10 +111,8 @@ def run_steps(
     """Return the commands of a run, in order.
 
     Args:
-        spec: the run.
-        scene: its scene's folder.
+        scene, folder: the scene's folder and the output folder, whose content is replaced.
         checkout: folder of the backbone's checkout; None for the built-in trainer.
-        folder: output folder; its content is replaced.
         evaluate: options of `lapgs eval`, the last command; None leaves it out.
 
     Raises:
@@ -170,7 +163,7 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         *(*LAPGS, "train", str(scene), "--out", str(folder), "--overwrite", "--eval"),
         *("--iterations", str(spec.iterations), "--resolution", spec.resolution, "--images", spec.images),
         *("--seed", str(spec.seed), "--rasterizer", spec.rasterizer),
-        # Backbones compensate no exposure, and tables compare views as they are.
+        # Backbones compensate no exposure, and tables compare views without compensation.
         *_as_options({"exposure": "off", **spec.options, **levels}),
     )
 

@@ -19,8 +19,7 @@ from lapgs_plugin.scenes.resolution import parse_size
 
 logger = logging.getLogger(__name__)
 
-RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"
-"""What an experiment's folder holds."""
+RUNS, LOGS, SCENES, STORE = "runs", "logs", "scenes", "results.sqlite"  # in an experiment's folder
 MISSING = Path("SCENE")
 """Placeholder for a missing scene in commands that are only checked."""
 POLL_SECONDS = 0.5
@@ -38,10 +37,7 @@ def prepare(
     """Make the jobs of all distinct runs, in order.
 
     Args:
-        planned: the runs.
-        scenes: their scenes.
-        places: folders of scenes and checkouts.
-        folder: the experiment's folder.
+        folder: the experiment's.
         evaluate: options of `lapgs eval`; None leaves it out.
         mistakes: receives missing scenes and checkouts, and resolutions that a checkout's script cannot read.
 
@@ -60,15 +56,15 @@ def prepare(
                 check_sample_scene(*parse_size(scene.sample.size), scene.sample.views, scene.sample.points)
                 where[scene.name] = scene, _sample_folder(scene.name, scene.sample, folder)
     checkouts: dict[str, Path] = {}
-    for name, key in {each.spec.checkout: each.spec.backbone for each in planned if each.spec.checkout}.items():
+    for name, key in {run.spec.checkout: run.spec.backbone for run in planned if run.spec.checkout}.items():
         with mistakes.at(f"backbones.{key}.checkout"):
             checkouts[name] = places.checkout(name)
     jobs: dict[str, Job] = {}
-    for each in planned:
-        spec = each.spec
+    for run in planned:
+        spec = run.spec
         if spec.checkout is not None and (spec.scene not in where or spec.checkout not in checkouts):
             continue
-        with mistakes.at(mistakes.keys_of(each)["resolution"]):
+        with mistakes.at(mistakes.keys_of(run)["resolution"]):
             own = folder.absolute() / RUNS / spec.run_id
             checkout = checkouts[spec.checkout] if spec.checkout else None
             scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
@@ -88,7 +84,7 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
         RunFolderError: another process locks the folder for too long.
     """
     samples = [(_sample_folder(scene.name, scene.sample, folder), scene.sample) for scene in scenes if scene.sample]
-    if all(place.is_dir() for place, _ in samples):
+    if all(path.is_dir() for path, _ in samples):
         return
     from lapgs_plugin.scenes.sample import make_sample_scene  # needs packages that read scenes
 
@@ -97,10 +93,10 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
         parent.mkdir(parents=True, exist_ok=True)
     lock = FolderLock.acquire(parent, LOCK_TIMEOUT)
     try:
-        for place, sample in samples:
-            if not place.is_dir():  # another process may have made it meanwhile
+        for path, sample in samples:
+            if not path.is_dir():  # another process may have made it meanwhile
                 width, height = parse_size(sample.size)
-                make_sample_scene(place, width=width, height=height, views=sample.views, points=sample.points)
+                make_sample_scene(path, width=width, height=height, views=sample.views, points=sample.points)
     finally:
         lock.release()
 
@@ -115,8 +111,6 @@ def execute(
     """Wait until all runs have ended, done by own workers or by others on the same store.
 
     Args:
-        store: the store of the runs.
-        run_ids: the runs.
         start: starts workers; called again when another process's worker died and left a run.
         on_end: called for every run that ends.
 

@@ -23,14 +23,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """One scene of an experiment.
+    """Describe one scene of an experiment.
 
     Attributes:
-        name: name of the scene.
-        dataset: its data set, "" without one.
+        dataset: "" without one.
         folder: as in the experiment, relative to its file; None when only --path or a variable gives it.
-        sample: options of a scene to be made, or None.
-        resolution, images: see `schema.Scenes`.
+        sample, resolution, images: see `schema.Scenes`.
     """
 
     name: str
@@ -43,14 +41,11 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One training run: everything that decides its result except the machine and the folders.
+    """Describe one training run: everything that decides its result except the machine and the folders.
 
     Attributes:
-        scene, dataset, images, resolution: the training images.
-        backbone: its name in the experiment.
         rasterizer, checkout: one of the two, see `schema.Backbone`.
         method: "hierarchy" or "bare".
-        iterations, seed: of the whole run.
         options: of `lapgs train` or `lapgs run`.
         arguments: of the checkout's script.
         sample: `schema.SampleScene.label` of a scene that was made, "" for others.
@@ -74,7 +69,7 @@ class RunSpec:
 
     @cached_property
     def run_id(self) -> str:
-        """Name of the run, different for different settings. Variants with equal settings share their runs."""
+        """Name of the run, by its settings. Variants with equal settings share their runs."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
         last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
@@ -84,7 +79,7 @@ class RunSpec:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run, and a variant that asks for it."""
+    """Pair a run with a variant that asks for it."""
 
     spec: RunSpec
     variant: str

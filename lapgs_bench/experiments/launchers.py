@@ -24,13 +24,11 @@ from lapgs_plugin.errors import UserInputError, require_extra, typed_line
 
 @dataclass(frozen=True)
 class WorkOrder:
-    """The work to start workers for.
+    """Describe the work of workers.
 
     Attributes:
-        store: the store of results, on a disk that all workers see.
-        run_ids: the runs to do.
+        store: of results, on a disk that all workers see.
         logs: folder for the workers' own output.
-        settings: where and how many at a time.
     """
 
     store: Path
@@ -40,7 +38,7 @@ class WorkOrder:
 
 
 class Launcher(ABC):
-    """The workers of one engine; creating it starts them."""
+    """Hold the workers of one engine; creating it starts them."""
 
     @staticmethod
     @abstractmethod
@@ -91,7 +89,7 @@ def check_launcher(settings: WorkerSettings) -> None:
 
 
 class LocalLauncher(Launcher):
-    """Threads of this process, one for each GPU or a single one without GPUs; cores are shared out evenly."""
+    """Start threads of this process, one for each GPU or a single one without GPUs; cores are shared out evenly."""
 
     @staticmethod
     def check(options: Mapping[str, Any]) -> None:
@@ -126,7 +124,7 @@ class LocalLauncher(Launcher):
 
 
 class SlurmLauncher(Launcher):
-    """Jobs of Slurm, one for each worker, through submitit. Options are submitit's, such as slurm_partition=gpu.
+    """Start jobs of Slurm, one for each worker, through submitit. Options are submitit's, such as slurm_partition=gpu.
 
     The option cluster=local runs the jobs on this machine, as a trial.
     """
@@ -164,7 +162,7 @@ class SlurmLauncher(Launcher):
 
 
 class RayLauncher(Launcher):
-    """Tasks of Ray, one for each worker, on this machine's cluster or a new local one.
+    """Start tasks of Ray, one for each worker, on this machine's cluster or a new local one.
 
     Options: address; num_gpus and num_cpus of a worker. Ray restarts a task whose process died.
     """

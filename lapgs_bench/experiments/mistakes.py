@@ -14,13 +14,7 @@ from lapgs_plugin.errors import LapgsError
 
 
 class Mistakes:
-    """The mistakes of one experiment file, each one line: file, key, value, expectation.
-
-    Args:
-        file: the experiment file.
-        experiment: its content.
-        selection: the part of it to run.
-    """
+    """Collect the mistakes of one experiment file, each one line: file, key, value, expectation."""
 
     def __init__(self, file: Path, experiment: Experiment, selection: Selection) -> None:
         self._file, self._experiment, self._selection = file, experiment, selection

@@ -45,7 +45,7 @@ FIGURES = ("train_seconds", "gaussians")
 
 @dataclass(frozen=True)
 class Results:
-    """The results in an experiment's folder: the rows of its results.csv, in order."""
+    """Hold the results in an experiment's folder: the rows of its results.csv, in order."""
 
     folder: Path
     rows: Sequence[Row]
@@ -141,12 +141,12 @@ def _tables(path: Path) -> tuple[str, str]:
 
 def _machines(results: Results) -> list[str]:
     """Describe machines and versions."""
-    found = {
+    lines = {
         ", ".join(str(row[name]) for name in ("gpu", "processor") if row.get(name))
         + f": lapgs_plugin {row.get('lapgs_version', '?')}, PyTorch {row.get('torch', '?')}"
         for row in results.rows
     }
-    return sorted(found)
+    return sorted(lines)
 
 
 # All scenes and backbones together.
@@ -211,10 +211,10 @@ def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable
 
 
 def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -> dict[str, Any]:
-    """Return what the page shows of a scene on a backbone, with the first seed of every variant.
+    """Return the page's part about a scene on a backbone, with the first seed of every variant.
 
     Keys: title; charts of training, and variants by the style of their lines; views of a variant beside the baseline
-    as pictures and as a table, and the variants that these compare, in words; notes on what could not be shown.
+    as pictures and as a table, and the variants that these compare, in words; notes on missing runs.
     """
     runs: dict[str, MeasuredRun] = {}
     notes = []

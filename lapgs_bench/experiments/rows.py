@@ -4,7 +4,7 @@
     psnr, ssim, lpips_*, fps            and every other number of metrics.json
     measured_by                         "lapgs eval" or "training": origin of the image metrics
     gpu_busy_seconds                    of the optimization, with --gpu-busy
-    train_seconds, overhead_seconds, overhead_<what>_seconds, wall_seconds
+    train_seconds, overhead_seconds, overhead_<purpose>_seconds, wall_seconds
     gaussians, gaussians_level_<l>      of the archived fields; peak_gaussians, mean_gaussians during training
     peak_memory_bytes, peak_memory_without_images_bytes    on a GPU
     <part>_ms, iteration_ms             milliseconds an iteration, with --breakdown

@@ -45,7 +45,7 @@ SET_BY_EXPERIMENTS = {
 }
 """Parameters of `lapgs train` and `lapgs run` that an experiment sets by keys of its own.
 
-A settings file would hide from a run's name what decides its result."""
+A settings file would hide settings that decide a run's result from its name."""
 
 
 class RunsFailedError(LapgsError):
@@ -55,7 +55,7 @@ class RunsFailedError(LapgsError):
 
 
 def run_experiment(file: Path, settings: BenchSettings) -> None:
-    """Do what `lapgs bench EXPERIMENT` says in its help."""
+    """Run an experiment as the help of `lapgs bench EXPERIMENT` says."""
     file = experiment_file(file)
     experiment = load_experiment(file, _option_names())
     mistakes = Mistakes(file, experiment, settings.selection)
@@ -72,9 +72,9 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
         check_launcher(settings.engine)
         require_place(folder)
     scenes, places = scenes_of(experiment, settings.selection), Locations(settings.folders, file.parent)
-    jobs, found = prepare(planned, scenes, places, folder, _measuring(settings), mistakes)
+    jobs, scene_folders = prepare(planned, scenes, places, folder, _measuring(settings), mistakes)
     here = settings.engine.launcher == "local" and not settings.dry_run
-    check_runs(planned, jobs, found, mistakes, here=here)
+    check_runs(planned, jobs, scene_folders, mistakes, here=here)
     mistakes.refuse()
     if settings.dry_run:
         _print_commands(jobs)

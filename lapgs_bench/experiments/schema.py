@@ -25,7 +25,7 @@ Options = dict[str, bool | int | float | str]
 
 
 class ExperimentError(UserInputError):
-    """Mistakes in an experiment file, one line each."""
+    """Report mistakes in an experiment file, one line each."""
 
 
 def _known_preset(name: str) -> str:
@@ -38,13 +38,13 @@ PresetName = Annotated[str, AfterValidator(_known_preset)]
 
 
 class _StrictModel(BaseModel):
-    """Base of all tables of the file: unknown keys are errors, and numbers are not converted to text."""
+    """Refuse unknown keys in a table of the file, and numbers where text belongs."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class SampleScene(_StrictModel):
-    """Options of `lapgs sample` for a scene that is made before the first run."""
+    """Give options of `lapgs sample` for a scene that is made before the first run."""
 
     size: str = "480x320"
     views: int = Field(40, ge=2)
@@ -57,7 +57,7 @@ class SampleScene(_StrictModel):
 
 
 class Scenes(_StrictModel):
-    """One `[[scenes]]` table: a standard data set, a folder, or the sample scene.
+    """Check one `[[scenes]]` table: a standard data set, a folder, or the sample scene.
 
     Attributes:
         dataset: name of a standard data set; `only` selects some of its scenes.
@@ -100,7 +100,7 @@ class Scenes(_StrictModel):
 
 
 class Backbone(_StrictModel):
-    """One `[backbones.NAME]` table: the built-in trainer with a rasterizer, or a checkout.
+    """Check one `[backbones.NAME]` table: the built-in trainer with a rasterizer, or a checkout.
 
     Attributes:
         title: its name in tables; NAME by default.
@@ -133,7 +133,7 @@ class Backbone(_StrictModel):
 
 
 class Variant(_StrictModel):
-    """One `[[variants]]` table: a setting that every scene is trained with.
+    """Check one `[[variants]]` table: a setting that every scene is trained with.
 
     Attributes:
         name: its name in tables.
@@ -166,7 +166,7 @@ class Variant(_StrictModel):
 
 
 class Table(_StrictModel):
-    """The `[table]` table: how results are shown.
+    """Check the `[table]` table: how results are shown.
 
     Attributes:
         paper: the paper's table, a file in data/paper.
@@ -182,7 +182,7 @@ class Table(_StrictModel):
 
 
 class Experiment(_StrictModel):
-    """A whole experiment file."""
+    """Check a whole experiment file."""
 
     name: str = Field(pattern=NAME)
     title: str = Field(pattern=LINE)
@@ -277,25 +277,25 @@ def _first_duplicate(names: Sequence[T]) -> T | None:
 
 def _problems(error: ValidationError) -> list[str]:
     """Turn pydantic's errors into lines; a misspelt key is reported once, not also as a missing one."""
-    found: dict[tuple[str, ...], list[Any]] = {}
+    by_key: dict[tuple[str, ...], list[Any]] = {}
     for problem in error.errors(include_url=False):
         # A value with alternative types has an error for each type, under the type's name.
-        place = tuple(str(part) for part in problem["loc"] if part not in ALTERNATIVES)
-        found.setdefault(place, []).append(problem)
-    unknown = {place: _unknown_key(place) for place, each in found.items() if each[0]["type"] == "extra_forbidden"}
+        key = tuple(str(part) for part in problem["loc"] if part not in ALTERNATIVES)
+        by_key.setdefault(key, []).append(problem)
+    unknown = {key: _unknown_key(key) for key, problems in by_key.items() if problems[0]["type"] == "extra_forbidden"}
     lines = list(unknown.values())
-    for place, problems in found.items():
+    for key, problems in by_key.items():
         missing = problems[0]["type"] == "missing"
-        if place in unknown or (missing and any(place[:-1] == other[:-1] for other in unknown)):
+        if key in unknown or (missing and any(key[:-1] == other[:-1] for other in unknown)):
             continue
-        lines += [f"{'.'.join(place)} is missing; give it"] if missing else _wrong_value(".".join(place), problems)
+        lines += [f"{'.'.join(key)} is missing; give it"] if missing else _wrong_value(".".join(key), problems)
     return lines
 
 
-def _unknown_key(place: tuple[str, ...]) -> str:
-    holders = [part for part in place[:-1] if part in PARTS]
+def _unknown_key(key: tuple[str, ...]) -> str:
+    holders = [part for part in key[:-1] if part in PARTS]
     model = PARTS[holders[-1]] if holders else Experiment
-    return f"unknown key {'.'.join(place)}; {nearest(place[-1], model.model_fields.keys())}"
+    return f"unknown key {'.'.join(key)}; {nearest(key[-1], model.model_fields.keys())}"
 
 
 def _wrong_value(where: str, problems: list[Any]) -> list[str]:
@@ -303,7 +303,7 @@ def _wrong_value(where: str, problems: list[Any]) -> list[str]:
     received = problems[0]["input"]
     of_tables = problems[0]["type"] == "value_error" and isinstance(received, (dict, BaseModel))
     shown = "" if of_tables else f" = {received!r:.80}"
-    message = " or ".join(dict.fromkeys(re.sub(r"^Value error, ", "", str(each["msg"])) for each in problems))
+    message = " or ".join(dict.fromkeys(re.sub(r"^Value error, ", "", str(problem["msg"])) for problem in problems))
     return [f"{where}{shown}: {line}" if where else line for line in message.split("\n")]
 
 

@@ -1,4 +1,4 @@
-"""Declare what a user can choose about an experiment's runs. Imports no pydantic, which is slow to import."""
+"""Declare the options of an experiment's runs. Imports no pydantic, which is slow to import."""
 
 from __future__ import annotations
 
@@ -126,10 +126,10 @@ class BenchSettings:
 
 
 def _pairs(texts: Sequence[str] | None, name_of_option: str) -> dict[str, str]:
-    found = {}
+    values = {}
     for text in texts or ():
         name, separator, value = text.partition("=")
         if not (separator and name and value):
             raise UserInputError(f"{name_of_option} {text}: expected NAME=VALUE")
-        found[name] = value
-    return found
+        values[name] = value
+    return values

@@ -23,19 +23,14 @@ KEYS = ("dataset", "scene", "row")
 """Columns of a paper table that identify a row."""
 
 
-def experiment_file(given: Path) -> Path:
+def experiment_file(name: Path) -> Path:
     """Return the file of an experiment that a user gave by its path or, for one of `EXPERIMENTS`, by its name."""
-    return given if is_file(given) else EXPERIMENTS.get(str(given), given)
+    return name if is_file(name) else EXPERIMENTS.get(str(name), name)
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set that papers report on.
-
-    Attributes:
-        title: its name in papers.
-        scenes: its scenes in their usual order, each with the name of its folder of smaller images.
-    """
+    """Describe a data set by its title in papers and its scenes, each with the name of its folder of smaller images."""
 
     title: str
     scenes: Mapping[str, str]
@@ -43,13 +38,12 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Preset:
-    """Options that a backbone publishes.
+    """Hold options that a backbone publishes at `source`.
 
     Attributes:
-        source: where they are published.
-        common: options for every scene.
-        scenes: further options by scene.
-        options: options of `lapgs run` for what the script has no option for.
+        common: for every scene.
+        scenes: further ones by scene.
+        options: those of `lapgs run`, where the script has none.
     """
 
     source: str
@@ -64,7 +58,7 @@ class Preset:
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """A figure of the paper, or one for each level.
+    """Hold a figure of the paper, or one for each level.
 
     Attributes:
         values: one, or one for each level, coarsest first.
@@ -81,10 +75,7 @@ class PaperFigure:
 
 
 class PaperTable:
-    """One table of the paper.
-
-    Args:
-        name: its file in data/paper.
+    """Look up figures in one table of the paper, a file in data/paper.
 
     Raises:
         UserInputError: there is no table of that name.

@@ -59,14 +59,9 @@ _TABLES = (
 
 @dataclass(frozen=True)
 class Job:
-    """The information that a worker needs for a run.
+    """Describe a run to a worker: its settings, output folder, log file and commands.
 
     Attributes:
-        run_id: name of the run.
-        spec: settings of the run.
-        folder: output folder.
-        log: file for the output of its commands.
-        steps: its commands.
         evaluate: whether the last command is `lapgs eval`.
         defaults: see `commands.defaults_of`.
     """
@@ -103,12 +98,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Claim:
-    """A worker's right to one run.
+    """Give a worker the right to one run.
 
     Attributes:
         job: the run, in a folder of this attempt.
-        owner: unique name of the claim's holder.
-        number: number of claims of the run so far, with this one.
+        owner: unique name of the holder.
+        number: claims of the run so far, with this one.
     """
 
     job: Job
@@ -118,14 +113,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run in the store.
-
-    Attributes:
-        run_id: name of the run.
-        state: "pending", "running", "done" or "failed".
-        record: the row of a finished run, else None.
-        error: reason of a failure, else "".
-    """
+    """Describe a run in the store: its state, the row of a finished run, the reason of a failure or ""."""
 
     run_id: str
     state: str
@@ -138,7 +126,7 @@ class Outcome:
 
 
 class ResultStore:
-    """An experiment's results. Each method is one transaction; threads may share an object.
+    """Keep an experiment's results. Each method is one transaction; threads may share an object.
 
     All methods raise RunFolderError when the file cannot be read or written.
 
@@ -196,8 +184,8 @@ class ResultStore:
                 )
 
     def _require_same_defaults(self, connection: sqlite3.Connection, jobs: Sequence[Job]) -> None:
-        found = connection.execute("SELECT run_id, job FROM runs WHERE state IN (?, ?)", (RUNNING, DONE)).fetchall()
-        begun = {run_id: Job.from_json(text) for run_id, text in found}
+        rows = connection.execute("SELECT run_id, job FROM runs WHERE state IN (?, ?)", (RUNNING, DONE)).fetchall()
+        begun = {run_id: Job.from_json(text) for run_id, text in rows}
         pairs = [(begun[job.run_id].defaults, job.defaults) for job in jobs if job.run_id in begun]
         others = [pair for pair in pairs if pair[0] != pair[1]]
         if others and len(pairs) < len(jobs):
@@ -250,10 +238,10 @@ class ResultStore:
         """Return all runs, or these, in order."""
         wanted = None if run_ids is None else set(run_ids)
         with _transaction(self._path) as connection:
-            found = connection.execute("SELECT run_id, state, record, error FROM runs ORDER BY position").fetchall()
+            rows = connection.execute("SELECT run_id, state, record, error FROM runs ORDER BY position").fetchall()
         return [
             Outcome(run_id, state, None if record is None else self._row(run_id, record), error or "")
-            for run_id, state, record, error in found
+            for run_id, state, record, error in rows
             if wanted is None or run_id in wanted
         ]
 
@@ -276,7 +264,7 @@ class ResultStore:
 def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a transaction that locks out other processes."""
     try:
-        # Closing rolls back what was not committed.
+        # Closing rolls back an uncommitted transaction.
         with closing(sqlite3.connect(path, timeout=LOCK_TIMEOUT, isolation_level=None)) as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
@@ -293,11 +281,11 @@ def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
 def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[tuple[str, str, int]]:
     """Yield name, job and claims of those of these runs that wait or were abandoned, in order."""
     wanted, now = set(run_ids), time.time()
-    found = connection.execute(
+    rows = connection.execute(
         "SELECT run_id, job, claims, state, owner, lease_until FROM runs WHERE state IN (?, ?) ORDER BY position",
         (PENDING, RUNNING),
     ).fetchall()
-    for run_id, job, claims, state, holder, lease_until in found:
+    for run_id, job, claims, state, holder, lease_until in rows:
         if run_id in wanted and (state == PENDING or _abandoned(holder, lease_until, now)):
             yield run_id, job, claims
 

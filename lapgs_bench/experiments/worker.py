@@ -29,7 +29,7 @@ LAST_LINES = 12
 
 @dataclass(frozen=True)
 class Slot:
-    """The part of a machine for a worker.
+    """Reserve a part of a machine for a worker.
 
     Attributes:
         gpu: value of CUDA_VISIBLE_DEVICES; None leaves it unchanged.
@@ -41,7 +41,7 @@ class Slot:
 
 
 class RunStopped(Exception):
-    """The run was killed on request, or because its claim was lost."""
+    """Report that a run was killed on request, or because its claim was lost."""
 
 
 def work(
@@ -49,11 +49,7 @@ def work(
 ) -> int:
     """Claim and run these runs until none is free.
 
-    Args:
-        store_path: the store of results.
-        run_ids: the runs that may be claimed.
-        slot: the part of the machine to use.
-        stop: when set, the current run is killed and released.
+    If `stop` is set, the current run is killed and released.
 
     Returns:
         Number of runs that ended, done or failed.
@@ -76,7 +72,7 @@ def work(
 
 
 class RunFailedError(LapgsError):
-    """A command of a run failed; the message has the end of its log, line by line."""
+    """Report a failed command of a run, with the end of its log, line by line."""
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:

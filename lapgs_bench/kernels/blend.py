@@ -102,7 +102,7 @@ def views_around(field: GaussianField, width: int, height: int, views: int) -> l
     lens = Camera(width, height, focal, focal, width / 2, height / 2, torch.eye(4))
     angles = 2 * np.pi * np.arange(views) / views
     ahead = [unit(np.array([-np.sin(angle), 0.3, np.cos(angle)])) for angle in angles]
-    return [looking(lens, middle - distance * each, middle, np.array([0.0, -1.0, 0.0])) for each in ahead]
+    return [looking(lens, middle - distance * direction, middle, np.array([0.0, -1.0, 0.0])) for direction in ahead]
 
 
 @torch.no_grad()
@@ -116,63 +116,65 @@ def sorted_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Sorted:
     return Sorted(seen.records, background, *tiles)
 
 
-def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
+def gsplats_kernels(tiles: Sorted, size: tuple[int, int]) -> Kernels:
     """Return gsplat's, which take the numbers of a Gaussian one by one."""
     from gsplat.cuda._backend import _C as compiled
 
-    none = given.records.new_zeros(len(given.records), size[1], size[0], 1)
+    none = tiles.records.new_zeros(len(tiles.records), size[1], size[0], 1)
     color = slice(COLOR_IN_RECORD, COLOR_IN_RECORD + 3)
-    parts = [given.records[..., part].contiguous() for part in (slice(2), slice(2, 5), color, 5)]
-    background = given.background.expand(len(given.records), -1).contiguous()
+    parts = [tiles.records[..., part].contiguous() for part in (slice(2), slice(2, 5), color, 5)]
+    background = tiles.background.expand(len(tiles.records), -1).contiguous()
     across, down = grid_of(size)
-    all_tiles = len(given.records) * down * across
-    flat = given.flat[: int(given.offsets[all_tiles])] if len(given.offsets) > all_tiles else given.flat
-    offsets = given.offsets[:all_tiles].view(-1, down, across)
+    all_tiles = len(tiles.records) * down * across
+    flat = tiles.flat[: int(tiles.offsets[all_tiles])] if len(tiles.offsets) > all_tiles else tiles.flat
+    offsets = tiles.offsets[:all_tiles].view(-1, down, across)
     taken = *parts, background, None, *size, TILE, offsets, flat
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
-        found: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(*taken, *blended[1:], by_images, none, False)
-        return found
+        gradients: Sequence[Tensor] = compiled.rasterize_to_pixels_3dgs_bwd(
+            *taken, *blended[1:], by_images, none, False
+        )
+        return gradients
 
-    return Kernels(partial(compiled.rasterize_to_pixels_3dgs_fwd, *taken), backward, lambda found: found[1:])
+    return Kernels(partial(compiled.rasterize_to_pixels_3dgs_fwd, *taken), backward, lambda gradients: gradients[1:])
 
 
-def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
+def our_kernels(tiles: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
     """Return ours, in one shape."""
     from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         images, counts, words = blended
-        rest = given.offsets, given.flat, images, counts, words, by_images
-        return blend_backward(given.records, *rest, False, shape)
+        rest = tiles.offsets, tiles.flat, images, counts, words, by_images
+        return blend_backward(tiles.records, *rest, False, shape)
 
-    def parts(found: Sequence[Tensor]) -> Sequence[Tensor]:
-        first, rest = found
+    def parts(gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        first, rest = gradients
         return first[..., 4:6], torch.cat([first[..., 6:], rest[..., :1]], -1), first[..., :3], first[..., 3]
 
-    return Kernels(partial(blend_forward, *given, size, len(given.records), shape), backward, parts)
+    return Kernels(partial(blend_forward, *tiles, size, len(tiles.records), shape), backward, parts)
 
 
 def time_kernels(
     field: GaussianField, cameras: Sequence[Camera], repeats: int, shapes: Mapping[str, Shape]
 ) -> Iterator[BlendTime]:
     """Time all kernels for some views of a field, in turns."""
-    given, (width, height) = sorted_gaussians(field, cameras), (cameras[0].width, cameras[0].height)
+    tiles, (width, height) = sorted_gaussians(field, cameras), (cameras[0].width, cameras[0].height)
     generator = torch.Generator().manual_seed(0)
     by_images = torch.randn(len(cameras), height, width, 3, generator=generator).cuda()
-    kernels = {"gsplat": gsplats_kernels(given, (width, height))}
-    kernels |= {name: our_kernels(given, (width, height), shape) for name, shape in shapes.items()}
+    kernels = {"gsplat": gsplats_kernels(tiles, (width, height))}
+    kernels |= {name: our_kernels(tiles, (width, height), shape) for name, shape in shapes.items()}
     results = {}
     for name, one in kernels.items():
-        made = one.forward()
-        results[name] = made, (made[0], *one.parts(one.backward(made, by_images)))
+        blended = one.forward()
+        results[name] = blended, (blended[0], *one.parts(one.backward(blended, by_images)))
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in kernels}
     for name, one in [*kernels.items()] * repeats:
         back = partial(one.backward, results[name][0], by_images)
         times[name].append((_milliseconds(one.forward), _milliseconds(back)))
     count, expected = len(cameras), results["gsplat"][1]
-    for name, (_, found) in results.items():
-        pairs = zip(found, expected, strict=True)
+    for name, (_, tensors) in results.items():
+        pairs = zip(tensors, expected, strict=True)
         difference = max(float((one - other).abs().max() / other.abs().max()) for one, other in pairs)
         forward, backward = (median(turns) / count for turns in zip(*times[name], strict=True))
         yield BlendTime(name, forward, backward, difference)

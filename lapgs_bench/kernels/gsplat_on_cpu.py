@@ -147,8 +147,8 @@ def _indices_in_range(
     if not pixels:
         nothing = torch.zeros(0, dtype=torch.int64)
         return nothing, nothing, nothing
-    found = torch.cat(pixels)
-    return torch.cat(gaussians), found, torch.zeros_like(found)
+    all_pixels = torch.cat(pixels)
+    return torch.cat(gaussians), all_pixels, torch.zeros_like(all_pixels)
 
 
 def _weights_from_alphas(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:

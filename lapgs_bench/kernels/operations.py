@@ -92,14 +92,14 @@ def benchmark(device: torch.device, width: int, height: int, gaussians: int, rep
     }
     if device.type == "cuda":
         operations["Adam of a checkout"] = _checkout_adam_versions(gaussians, device)
-    return [found for op, versions in operations.items() for found in _time(op, versions, device, repeats)]
+    return [one for op, versions in operations.items() for one in _time(op, versions, device, repeats)]
 
 
 def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> list[OpTime]:
     results = {}
     for name, version in versions.items():
-        found = version.run()  # the first call compiles
-        result = found if version.result is None else version.result
+        returned = version.run()  # the first call compiles
+        result = returned if version.result is None else version.result
         assert isinstance(result, Tensor)
         results[name] = result.detach().clone()
     seconds: dict[str, list[float]] = {name: [] for name in versions}
@@ -199,10 +199,10 @@ def _adam_versions(ours: str, gaussians: int, device: torch.device) -> Versions:
 
     versions = {
         TORCH: version(plain),
-        "torch.optim.Adam": version(lambda made: torch.optim.Adam(made, 1e-3, eps=adam.ADAM_EPS, fused=True).step),
+        "torch.optim.Adam": version(lambda params: torch.optim.Adam(params, 1e-3, eps=adam.ADAM_EPS, fused=True).step),
     }
     if ours == NUMBA:
-        versions[ours] = version(lambda made: FieldAdam(made, 1e-3).step)
+        versions[ours] = version(lambda params: FieldAdam(params, 1e-3).step)
     elif adam.triton_works():
         versions[ours] = version(triton)
     return versions
@@ -212,17 +212,17 @@ def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
     """Return versions of the optimizer that 3DGS's scripts make, whose SH are two tensors."""
     version = _stepping([(3,), (1, 3), (15, 3), (1,), (3,), (4,)], gaussians, device)
 
-    def made(parameters: list[torch.nn.Parameter], fused: bool | None = None) -> torch.optim.Adam:
+    def make(parameters: list[torch.nn.Parameter], fused: bool | None = None) -> torch.optim.Adam:
         return torch.optim.Adam([{"params": [one]} for one in parameters], 1e-3, eps=adam.ADAM_EPS, fused=fused)
 
     def ours(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
-        optimizer = made(parameters)
+        optimizer = make(parameters)
         tensorwise.fuse_steps(optimizer)
         return optimizer.step
 
     versions = {
-        TORCH: version(lambda parameters: made(parameters).step),
-        "its fused Adam": version(lambda parameters: made(parameters, fused=True).step),
+        TORCH: version(lambda parameters: make(parameters).step),
+        "its fused Adam": version(lambda parameters: make(parameters, fused=True).step),
     }
     if tensorwise.triton_works():
         versions["Triton"] = version(ours)
@@ -232,7 +232,7 @@ def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
 def _stepping(
     shapes: Sequence[tuple[int, ...]], gaussians: int, device: torch.device
 ) -> Callable[[Callable[[list[torch.nn.Parameter]], Callable[[], object]]], Version]:
-    """Return what makes a version of a function that returns an optimizer's step for parameters of these shapes."""
+    """Return a function that makes a version of an optimizer's step for parameters of these shapes."""
     generator = torch.Generator().manual_seed(0)
     starts, gradients = (
         [torch.randn(gaussians, *shape, generator=generator).to(device) for shape in shapes] for _ in range(2)

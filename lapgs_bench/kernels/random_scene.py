@@ -16,7 +16,7 @@ from lapgs_plugin.reference_raster import layout, oracle
 
 @dataclass(frozen=True)
 class BenchScene:
-    """A field, a camera that sees it, and a target image."""
+    """Hold a field, a camera that sees it, and a target image."""
 
     field: GaussianField
     camera: Camera

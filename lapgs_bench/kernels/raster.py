@@ -34,8 +34,8 @@ from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer, pipeline
 
+# The contenders: the fast rasterizer with our loss and Adam, and the others with PyTorch's.
 FAST, ORACLE, GSPLAT = "cpu", "oracle", "gsplat"
-"""The contenders: the fast rasterizer with our loss and Adam, and the others with PyTorch's."""
 
 MAX_LOSS_SHARE = 0.20
 """Largest time of the loss, as a share of the rest of an iteration."""
@@ -48,17 +48,16 @@ LEARNING_RATE = 1e-6  # so small that the scene keeps its statistics
 GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
 """Slow contenders take part in as many turns as add up to this many Gaussians, at least in one."""
 
+# Limits of a case, so that a typing error does not fill a machine's memory.
 MAX_SIDE, MAX_GAUSSIANS = 8192, 10_000_000
-"""Limits of a case, so that a typing error does not fill a machine's memory."""
 
 
 @dataclass(frozen=True)
 class BenchCase:
-    """A scene to time.
+    """Describe a scene to time.
 
     Attributes:
         width, height: of the image, in pixels.
-        gaussians: number in the scene.
         required: by contender, the least ratio of its time to the fast one's.
     """
 
@@ -117,7 +116,7 @@ def _parse_case(entry: str) -> BenchCase:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Measurements of one case; times are medians in milliseconds.
+    """Hold the measurements of one case; times are medians in milliseconds.
 
     Attributes:
         blended_per_pixel: Gaussians that a pixel blends, on average.
@@ -183,7 +182,7 @@ def machine() -> dict[str, str | int]:
 
 
 class _Contender:
-    """An implementation with its own copy of the parameters."""
+    """Train an implementation's own copy of the parameters."""
 
     def __init__(
         self,
@@ -246,12 +245,12 @@ def _contenders(scene: BenchScene) -> dict[str, _Contender]:
     def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
         return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=ADAM_EPS)
 
-    found = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
+    contenders = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if GSPLAT in contender_names(scene.target.dtype):
         from lapgs_bench.kernels.gsplat_on_cpu import GsplatTorchRasterizer
 
-        found[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
-    return found
+        contenders[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
+    return contenders
 
 
 def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> list[str]:
