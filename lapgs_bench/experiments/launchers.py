@@ -55,7 +55,7 @@ class Launcher(ABC):
 
     @abstractmethod
     def running(self) -> bool:
-        """Whether a worker runs or waits for its start."""
+        """Return whether a worker runs or waits for its start."""
 
     @abstractmethod
     def stop(self) -> None:

@@ -34,7 +34,7 @@ LINEAR_FILES = {"torchmetrics": "functional/image/lpips_models/{}.pth", "lpips":
 
 
 class _Fire(nn.Module):
-    """SqueezeNet's fire module, with torchvision's names."""
+    """Apply SqueezeNet's fire module, with torchvision's names."""
 
     def __init__(self, before: int, squeezed: int, expanded: int) -> None:
         super().__init__()

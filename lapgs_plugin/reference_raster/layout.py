@@ -1,4 +1,4 @@
-"""Constants of the 3DGS rasterizers, and the layout of the arrays that our kernels exchange.
+"""Define constants of the 3DGS rasterizers, and the layout of the arrays that our kernels exchange.
 
 A change here makes all kernels compile again.
 """

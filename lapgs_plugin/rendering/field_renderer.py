@@ -141,7 +141,7 @@ class FieldRenderer:
         return self._black if self.fields[level].signed else self._colored
 
     def _stacks_at(self, cameras: Sequence[Camera], finest: int) -> bool:
-        """Whether to render these views in one set of launches. A batch shares its launches among its views."""
+        """Return whether to render these views in one set of launches. A batch shares its launches among its views."""
         if not self.concurrent or len(cameras) > 1 or not self.can_stack:
             return False
         camera = level_camera(cameras[0], finest)

@@ -24,7 +24,7 @@ Frame = Callable[[Sequence[Camera]], object]
 
 @dataclass(frozen=True)
 class Speed:
-    """How long frames of one kind take.
+    """Hold the time of frames of one kind.
 
     Attributes:
         what: the kind.
@@ -68,7 +68,7 @@ def composed_speed(renderer: HierarchyRenderer, cameras: Sequence[Camera], round
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of frame to measure.
+    """Describe a kind of frame to measure.
 
     Attributes:
         what: its name.

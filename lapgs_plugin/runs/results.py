@@ -17,7 +17,7 @@ MEASURED = {"test": "held-out", "train": "training", "other": "another scene's"}
 
 
 class HistoryEntry(StrictWithMore):
-    """One line of the history."""
+    """Check one line of the history."""
 
     level: NonNegativeInt
     iteration: NonNegativeInt
@@ -31,7 +31,7 @@ class HistoryEntry(StrictWithMore):
 
 
 class _Distances(StrictWithMore):
-    """LPIPS variants that were measured."""
+    """Check LPIPS variants that were measured."""
 
     lpips_vgg: NotRequired[float]
     lpips_alex: NotRequired[float]
@@ -40,7 +40,7 @@ class _Distances(StrictWithMore):
 
 
 class MetricsOfView(_Distances):
-    """One view in `Metrics`."""
+    """Check one view in `Metrics`."""
 
     name: str
     psnr: float
@@ -49,7 +49,7 @@ class MetricsOfView(_Distances):
 
 
 class MetricsOfLevel(StrictWithMore):
-    """One level in `Metrics`."""
+    """Check one level in `Metrics`."""
 
     psnr: float
     upsampled_psnr: float
@@ -65,7 +65,7 @@ class MetricsOfLevel(StrictWithMore):
 
 
 class Metrics(_Distances):
-    """The metrics of a run, as far as `evaluation.figures` describes them."""
+    """Check the metrics of a run, as far as `evaluation.figures` describes them."""
 
     psnr: NotRequired[float]
     fitted_psnr: NotRequired[float]
@@ -91,7 +91,7 @@ class Metrics(_Distances):
 
 
 class Timeline(Strict):
-    """One moment of a `BareRecord`."""
+    """Check one moment of a `BareRecord`."""
 
     iteration: NonNegativeInt
     elapsed: NonNegativeFloat
@@ -99,7 +99,7 @@ class Timeline(Strict):
 
 
 class BareRecord(Strict):
-    """A script's own run without a hierarchy, as `lapgs run --off --record` measures it (`runner.recording`)."""
+    """Check the record of a script's own run, as `lapgs run --off --record` measures it (`runner.recording`)."""
 
     backbone: NotRequired[str]
     iterations: PositiveInt

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import struct
 from pathlib import Path
 
@@ -59,7 +60,7 @@ def standard_table(field: GaussianField) -> np.ndarray:
             field.means.numpy(),
             np.zeros((n, 3), np.float32),
             field.sh[:, 0].numpy(),
-            field.sh[:, 1:].permute(0, 2, 1).reshape(n, -1).numpy(),
+            field.sh[:, 1:].permute(0, 2, 1).flatten(1).numpy(),
             field.opacity_logits[:, None].numpy(),
             field.log_scales.numpy(),
             field.quaternions.numpy(),
@@ -85,23 +86,16 @@ def write_variant(
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 6])
 @pytest.mark.parametrize("signed", [False, True])
-def test_a_saved_field_is_3dgs_own_file_byte_for_byte(tmp_path: Path, degree: int, signed: bool) -> None:
-    field = random_field(5, degree, signed)
+def test_a_saved_field_is_3dgs_own_file_and_comes_back(tmp_path: Path, degree: int, n: int, signed: bool) -> None:
+    field = random_field(n, degree, signed)
     field.save_ply(tmp_path / "field.ply")
-    header = ["ply", "format binary_little_endian 1.0", *["comment lapgs_signed 1"] * signed, "element vertex 5"]
+    header = ["ply", "format binary_little_endian 1.0", *["comment lapgs_signed 1"] * signed, f"element vertex {n}"]
     header += [f"property float {name}" for name in standard_names(degree)] + ["end_header", ""]
     table = standard_table(field)
     expected = "\n".join(header).encode() + struct.pack(f"<{table.size}f", *table.ravel())
     assert (tmp_path / "field.ply").read_bytes() == expected
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("n", [0, 1, 6])
-@pytest.mark.parametrize("signed", [False, True])
-def test_round_trip_of_every_size(tmp_path: Path, degree: int, n: int, signed: bool) -> None:
-    field = random_field(n, degree, signed)
-    field.save_ply(tmp_path / "field.ply")
     assert_same_bits(field, GaussianField.load_ply(tmp_path / "field.ply"))
     assert count_gaussians(tmp_path / "field.ply") == n
 
@@ -127,14 +121,8 @@ def test_round_trip_keeps_the_bits_of_any_finite_float32(tmp_path: Path, data: s
 def test_reads_every_encoding(tmp_path: Path, kind: str, form: str, degree: int) -> None:
     field = random_field(4, degree)
     text = form == "ascii"
-    write_variant(
-        tmp_path / "f.ply",
-        standard_names(degree),
-        standard_table(field),
-        kind=kind,
-        byte_order="=" if text else form,
-        text=text,
-    )
+    names, table, order = standard_names(degree), standard_table(field), "=" if text else form
+    write_variant(tmp_path / "f.ply", names, table, kind=kind, byte_order=order, text=text)
     loaded = GaussianField.load_ply(tmp_path / "f.ply")
     assert loaded.sh_degree == degree
     for name, tensor in field.parameters.items():
@@ -188,15 +176,6 @@ def test_a_file_cut_short_anywhere_is_an_error(tmp_path: Path, cut: int, form: s
             read(tmp_path / "cut.ply")
 
 
-def test_a_cut_file_says_after_which_gaussian(tmp_path: Path) -> None:
-    random_field(9, 0).save_ply(tmp_path / "f.ply")
-    contents = (tmp_path / "f.ply").read_bytes()
-    row = 4 * len(standard_names(0))
-    (tmp_path / "f.ply").write_bytes(contents[: -3 * row - 1])
-    with pytest.raises(FieldError, match=r"f\.ply: it is cut short or damaged after 5 of 9"):
-        GaussianField.load_ply(tmp_path / "f.ply")
-
-
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(position=st.integers(0, 3000), value=st.integers(0, 255))
 def test_a_damaged_header_is_an_error_or_another_field_never_a_crash(tmp_path: Path, position: int, value: int) -> None:
@@ -228,36 +207,21 @@ def test_missing_properties_are_named(tmp_path: Path, drop: list[str], message: 
         GaussianField.load_ply(tmp_path / "f.ply")
 
 
-def test_a_point_cloud_is_not_a_field(tmp_path: Path) -> None:
+def test_files_that_hold_no_field(tmp_path: Path) -> None:
     write_variant(tmp_path / "points.ply", ["x", "y", "z", "red", "green", "blue"], np.zeros((2, 6)))
-    with pytest.raises(FieldError, match="not a point cloud"):
-        GaussianField.load_ply(tmp_path / "points.ply")
-
-
-def test_files_that_are_no_ply(tmp_path: Path) -> None:
-    (tmp_path / "image.ply").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
-    (tmp_path / "empty.ply").write_bytes(b"")
     (tmp_path / "folder.ply").mkdir()
-    for name in ("image.ply", "empty.ply", "folder.ply", "missing.ply"):
-        with pytest.raises(FieldError, match=name):
+    for name, words in (("points.ply", "not a point cloud"), ("folder.ply", ""), ("missing.ply", "")):
+        with pytest.raises(FieldError, match=f"{name}.*{words}"):
             GaussianField.load_ply(tmp_path / name)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])  # the last one is beyond float32
 @pytest.mark.parametrize("name", ["y", "f_dc_2", "f_rest_16", "opacity", "scale_1", "rot_3"])
 def test_numbers_that_are_not_finite_are_located(tmp_path: Path, name: str, bad: float) -> None:
-    names, table = standard_names(3), standard_table(random_field(6, 3))
+    names, table = standard_names(3), standard_table(random_field(6, 3)).astype(np.float64)
     table[[2, 5], names.index(name)] = bad
-    write_variant(tmp_path / "f.ply", names, table)
+    write_variant(tmp_path / "f.ply", names, table, kind="f8" if bad == 1e300 else "f4")
     with pytest.raises(FieldError, match=f"{name} is NaN or inf for 2 of 6 Gaussians, first at index 2"):
-        GaussianField.load_ply(tmp_path / "f.ply")
-
-
-def test_doubles_beyond_float32_are_located(tmp_path: Path) -> None:
-    names, table = standard_names(0), standard_table(random_field(3, 0)).astype(np.float64)
-    table[1, names.index("scale_0")] = 1e300
-    write_variant(tmp_path / "f.ply", names, table, kind="f8")
-    with pytest.raises(FieldError, match="scale_0 is NaN or inf for 1 of 3"):
         GaussianField.load_ply(tmp_path / "f.ply")
 
 
@@ -290,18 +254,18 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, mon
 
 
 @pytest.mark.parametrize(
-    ("name", "shape", "message"),
+    ("name", "shape"),
     [
-        ("means", (5, 2), r"means has shape \(5, 2\)"),
-        ("means", (), r"means has shape \(\), expected \(0, 3\)"),
-        ("quaternions", (4, 4), r"quaternions has shape \(4, 4\), expected \(5, 4\)"),
-        ("opacity_logits", (5, 1), r"opacity_logits has shape \(5, 1\)"),
-        ("sh", (5, 5, 3), r"sh has shape \(5, 5, 3\)"),
-        ("sh", (5, 3), r"sh has shape \(5, 3\)"),
+        ("means", (5, 2)),
+        ("means", ()),
+        ("quaternions", (4, 4)),
+        ("opacity_logits", (5, 1)),
+        ("sh", (5, 5, 3)),
+        ("sh", (5, 3)),
     ],
 )
-def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...], message: str) -> None:
-    with pytest.raises(FieldError, match=message):
+def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(FieldError, match=re.escape(f"{name} has shape {shape}, expected (")):
         random_field(5, 1).with_parameters({name: torch.zeros(shape)})
 
 

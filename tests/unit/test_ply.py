@@ -27,6 +27,7 @@ def ply(kind: str, elements: str, data: bytes = b"0 0 0\n") -> bytes:
 
 DAMAGED = {
     "empty": (b"", "is not a PLY file"),
+    "image": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "is not a PLY file"),
     "no ply": (b"PK\x03\x04", "is not a PLY file"),
     "no end": (b"ply\n" + b"comment a\n" * 100_000, "no end_header in its first"),
     "one line": (b"ply\n" + b"a" * 2_000_000, "no end_header in its first"),
@@ -82,8 +83,8 @@ def test_whole_files_of_several_elements_are_read(text: bool, tmp_path: Path) ->
     for line_break in (b"\n", b"\r\n"):
         header = ply(ASCII if text else BINARY, elements, b"").replace(b"\n", line_break)
         (tmp_path / "a.ply").write_bytes(header + data)
-        found = read_ply(tmp_path / "a.ply")["vertex"]
-        assert [tuple(row) for row in found.data] == [(1, 2, 3), (4, 5, 6)]
+        vertices = read_ply(tmp_path / "a.ply")["vertex"]
+        assert [tuple(row) for row in vertices.data] == [(1, 2, 3), (4, 5, 6)]
 
 
 @pytest.mark.parametrize(

@@ -30,24 +30,24 @@ def read_spz(path: Path) -> tuple[GaussianField, int]:
     data = gzip.decompress(path.read_bytes())
     magic, version, count, degree, fractional_bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
     assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
-    place = 16
+    offset = 16
 
-    def take(each: int) -> list[bytes]:
-        nonlocal place
-        begin, place = place, place + each * count
-        return [data[begin + i * each : begin + (i + 1) * each] for i in range(count)]
+    def take(size: int) -> list[bytes]:
+        nonlocal offset
+        begin, offset = offset, offset + size * count
+        return [data[begin + i * size : begin + (i + 1) * size] for i in range(count)]
 
     means = [
-        [int.from_bytes(each[3 * i : 3 * i + 3], "little", signed=True) / 2**fractional_bits for i in range(3)]
-        for each in take(9)
+        [int.from_bytes(row[3 * i : 3 * i + 3], "little", signed=True) / 2**fractional_bits for i in range(3)]
+        for row in take(9)
     ]
-    opacities = [min(max(each[0] / 255, 1e-6), 1 - 1e-6) for each in take(1)]
-    first = [[(byte / 255 - 0.5) / 0.15 for byte in each] for each in take(3)]
-    scales = [[byte / 16 - 10 for byte in each] for each in take(3)]
-    quaternions = [read_rotation(int.from_bytes(each, "little")) for each in take(4)]
+    opacities = [min(max(row[0] / 255, 1e-6), 1 - 1e-6) for row in take(1)]
+    first = [[(byte / 255 - 0.5) / 0.15 for byte in row] for row in take(3)]
+    scales = [[byte / 16 - 10 for byte in row] for row in take(3)]
+    quaternions = [read_rotation(int.from_bytes(row, "little")) for row in take(4)]
     rest = (degree + 1) ** 2 - 1
-    higher = [[(byte - 128) / 128 for byte in each] for each in take(3 * rest)]
-    assert place == len(data)
+    higher = [[(byte - 128) / 128 for byte in row] for row in take(3 * rest)]
+    assert offset == len(data)
     sh = torch.cat([torch.tensor(first).view(count, 1, 3), torch.tensor(higher).view(count, rest, 3)], dim=1)
     field = GaussianField(
         means=torch.tensor(means).view(count, 3),
@@ -63,7 +63,7 @@ def read_rotation(packed: int) -> list[float]:
     """Decode a quaternion wxyz from its three smallest components of ten bits, the last one lowest."""
     largest = packed >> 30
     xyzw = [0.0] * 4
-    for component in reversed([each for each in range(4) if each != largest]):
+    for component in reversed([i for i in range(4) if i != largest]):
         size = (packed & 511) / 511 * math.sqrt(0.5)
         xyzw[component] = -size if packed & 512 else size
         packed >>= 10
@@ -132,7 +132,7 @@ def test_the_picture_is_nearly_the_same(tmp_path: Path) -> None:
     field, camera = blob_field(), ring_camera(0.3, 160, 120)
     save_spz(field, tmp_path / "field.spz", "")
     back = in_our_axes(read_spz(tmp_path / "field.spz")[0])
-    before, after = (CpuRasterizer()(each, camera, background=torch.zeros(3)).image for each in (field, back))
+    before, after = (CpuRasterizer()(shown, camera, background=torch.zeros(3)).image for shown in (field, back))
     assert -10 * math.log10(float((before - after).square().mean())) > 40.0  # 44.4 dB seen
 
 
