@@ -70,24 +70,14 @@ def test_a_fresh_field_is_as_large_as_its_spacing(n: int, copies: int, scale: fl
     assert not field.sh[:, 1:].any()
 
 
-def test_clouds_of_one_two_and_three_points() -> None:
+def test_clouds_of_few_places() -> None:
+    field = field_from_points(torch.ones(9, 3), torch.rand(9, 3), 1)
+    field.require_finite()
+    torch.testing.assert_close(field.log_scales.exp(), torch.full((9, 3), FLOOR))
     line = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 4, 0]])
     for n, expected in [(1, [FLOOR]), (2, [3.0, 3.0]), (3, [math.sqrt(17), math.sqrt(12.5), math.sqrt(20.5)])]:
         field = field_from_points(line[:n], torch.rand(n, 3), 0)
         torch.testing.assert_close(field.log_scales.exp()[:, 1], torch.tensor(expected))
-
-
-def test_a_cloud_of_one_place_is_finite() -> None:
-    field = field_from_points(torch.ones(9, 3), torch.rand(9, 3), 1)
-    field.require_finite()
-    torch.testing.assert_close(field.log_scales.exp(), torch.full((9, 3), FLOOR))
-
-
-def test_points_that_cannot_be_used() -> None:
-    with pytest.raises(UserInputError, match="0 points"):
-        field_from_points(torch.zeros(0, 3), torch.zeros(0, 3), 0)
-    with pytest.raises(UserInputError, match="not all finite"):
-        field_from_points(torch.tensor([[0.0, torch.nan, 0]]), torch.zeros(1, 3), 0)
 
 
 @pytest.mark.parametrize("degree", [None, 0, 3])
@@ -104,15 +94,16 @@ def test_xyz_keeps_positions_and_starts_the_rest_afresh(degree: int | None, sign
     assert all(torch.equal(old.parameters[name], tensor) for name, tensor in before.items())
 
 
-def test_geometry_keeps_all_but_colour() -> None:
+@pytest.mark.parametrize("mode", ["geometry", "full"])
+def test_geometry_keeps_all_but_colour_and_full_keeps_all(mode: str) -> None:
     old = base_field()
-    field, kept = inherit(old, "geometry")
+    field, kept = inherit(old, mode)
     assert torch.equal(kept, torch.arange(50))
     assert field.signed
-    assert not field.sh.any()
-    for name in ("means", "quaternions", "log_scales", "opacity_logits"):
-        assert torch.equal(field.parameters[name], old.parameters[name])
-        assert field.parameters[name].data_ptr() != old.parameters[name].data_ptr()
+    for name, tensor in old.parameters.items():
+        expected = tensor if mode == "full" or name != "sh" else torch.zeros_like(tensor)
+        assert torch.equal(field.parameters[name], expected)
+        assert field.parameters[name].data_ptr() != tensor.data_ptr()
 
 
 @pytest.mark.parametrize("mode", ["geometry", "xyz"])
@@ -122,16 +113,6 @@ def test_an_inherited_residual_renders_exactly_zero(mode: str) -> None:
     result = OracleRasterizer()(field, camera, background=torch.zeros(3))
     assert not result.image.any()
     assert result.transmittance.min() < 0.99  # the Gaussians are there
-
-
-def test_full_keeps_every_parameter() -> None:
-    old = base_field()
-    field, kept = inherit(old, "full")
-    assert torch.equal(kept, torch.arange(50))
-    assert field.signed
-    for name, tensor in old.parameters.items():
-        assert torch.equal(field.parameters[name], tensor)
-        assert field.parameters[name].data_ptr() != tensor.data_ptr()
 
 
 @pytest.mark.parametrize("mode", ["geometry", "xyz", "full"])
@@ -165,13 +146,14 @@ def test_scales_of_a_subset_follow_its_own_spacing() -> None:
     assert field.log_scales.exp().min() > 1.0 + 1e-3 > old.log_scales.exp().max()
 
 
-@pytest.mark.parametrize("ratio", [0.0, -0.5, 1.0001, math.nan, math.inf])
-def test_ratios_outside_the_unit_interval_are_refused(ratio: float) -> None:
-    with pytest.raises(UserInputError, match="expected a ratio above 0 and at most 1"):
-        inherit(base_field(), "xyz", ratio)
-
-
-def test_what_cannot_be_inherited() -> None:
+def test_what_cannot_be_used() -> None:
+    with pytest.raises(UserInputError, match="0 points"):
+        field_from_points(torch.zeros(0, 3), torch.zeros(0, 3), 0)
+    with pytest.raises(UserInputError, match="not all finite"):
+        field_from_points(torch.tensor([[0.0, torch.nan, 0]]), torch.zeros(1, 3), 0)
+    for ratio in (0.0, -0.5, 1.0001, math.nan, math.inf):
+        with pytest.raises(UserInputError, match="expected a ratio above 0 and at most 1"):
+            inherit(base_field(), "xyz", ratio)
     for mode in ("everything", "0.5", "geometry:0.5", ""):  # the command line's other forms would not be obeyed
         with pytest.raises(UserInputError, match=f"--inherit '{mode}': expected geometry, xyz, full; the ratio is"):
             inherit(base_field(), mode)

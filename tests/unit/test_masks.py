@@ -241,6 +241,6 @@ def test_masks_that_do_not_fit_are_one_line(scene: Path, tmp_path: Path) -> None
     masks[0].unlink()
     refused(r"1 of 4 photos have no mask, the first is .*; expected .*\.png, .* or .*_mask\.png")
     run = tmp_path / "run"
-    said = CliRunner().invoke(app, ["train", str(scene), "-o", str(run), "--masks", "masks"])
-    assert isinstance(said.exception, SceneError)
+    refusal = CliRunner().invoke(app, ["train", str(scene), "-o", str(run), "--masks", "masks"])
+    assert isinstance(refusal.exception, SceneError)
     assert not run.exists()

@@ -146,18 +146,73 @@ assert regularization.triton_works.difference(torch.device(DEVICE)) < 1e-5
 """
 
 
-def run_checks(device: str, **environment: str) -> None:
-    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{CHECKS}"]
+NOISE = """
+import torch
+from lapgs_plugin.ops import position_noise
+position_noise.triton_works = lambda means: True
+n = 20_000
+
+def drawn():
+    means = torch.zeros(n, 3)
+    upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
+    position_noise.add_noise(means, upright, torch.zeros(n, 3), torch.full((n,), -20.0), 1.0)
+    return means / torch.sigmoid(torch.tensor(0.5))
+
+torch.manual_seed(3)
+state = torch.get_rng_state()
+first, second = drawn(), drawn()
+torch.set_rng_state(state)  # as a resumed run does
+assert torch.equal(drawn(), first)
+both = torch.cat([first, second], 1)
+assert both.mean(0).abs().max() < 0.03, both.mean(0)  # worst seen 0.012
+covariance = torch.cov(both.T)
+assert (covariance - torch.eye(6)).abs().max() < 0.04, covariance  # worst seen 0.022
+assert (both.pow(4).mean(0) - 3).abs().max() < 0.3  # a normal distribution's; worst seen 0.16
+"""
+
+UPSAMPLE = """
+import torch
+from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton, upsample_triton
+for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
+    for grid in ("camera", "even"):
+        h, w = shape[-2:]
+        coarse, fine = torch.randn(*shape[:-2], (h + 1) // 2, (w + 1) // 2), torch.randn(*shape)
+        expected = Pyramid(grid).up(coarse, (h, w)) + fine
+        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as from gsplat
+        for images in ((coarse, fine), turned):
+            torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
+        half = upsample_add_triton(Pyramid(grid), coarse.half(), fine)
+        torch.testing.assert_close(half, Pyramid(grid).up(coarse.half().float(), (h, w)) + fine, rtol=0, atol=2e-6)
+        shown = upsample_add_triton(Pyramid(grid), coarse, fine, clamped=True)
+        torch.testing.assert_close(shown, expected.clamp(0, 1), rtol=0, atol=2e-6)
+        leaf = fine.clone().requires_grad_()
+        by_fine = torch.autograd.grad((upsample_add_triton(Pyramid(grid), coarse, leaf) * expected).sum(), leaf)
+        assert (by_fine[0] == expected).all()
+        gradients = []
+        adding = lambda image, size: upsample_add_triton(Pyramid(grid), image, fine)
+        for up in (Pyramid(grid).up, lambda *arguments: upsample_triton(Pyramid(grid), *arguments), adding):
+            leaf = coarse.clone().requires_grad_()
+            (up(leaf, (h, w)) * fine).sum().backward()
+            gradients.append(leaf.grad)
+        for gradient in gradients[1:]:
+            torch.testing.assert_close(gradient, gradients[0], rtol=0, atol=1e-5)
+"""
+
+
+def run_checks(checks: str, device: str, **environment: str) -> None:
+    command = [sys.executable, "-c", f"DEVICE = {device!r}\n{checks}"]
     done = subprocess.run(command, check=False, env={**os.environ, **environment}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-def test_interpreted() -> None:
-    run_checks("cpu", TRITON_INTERPRET="1")
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE], ids=["all", "noise", "upsample"])
+def test_interpreted(checks: str) -> None:
+    run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_compiled() -> None:
-    run_checks("cuda")
+    run_checks(CHECKS, "cuda")

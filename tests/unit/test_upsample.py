@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -21,37 +18,6 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
 from lapgs_plugin.hierarchy.settings import GRIDS
 from lapgs_plugin.ops.upsample import triton_works, upsample, upsample_add
-
-TRITON = """
-import os
-os.environ["TRITON_INTERPRET"] = "1"
-import torch
-from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton, upsample_triton
-for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
-    for grid in ("camera", "even"):
-        h, w = shape[-2:]
-        coarse, fine = torch.randn(*shape[:-2], (h + 1) // 2, (w + 1) // 2), torch.randn(*shape)
-        expected = Pyramid(grid).up(coarse, (h, w)) + fine
-        turned = [image.movedim(-3, -1).contiguous().movedim(-1, -3) for image in (coarse, fine)]  # as from gsplat
-        for images in ((coarse, fine), turned):
-            torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
-        half = upsample_add_triton(Pyramid(grid), coarse.half(), fine)
-        torch.testing.assert_close(half, Pyramid(grid).up(coarse.half().float(), (h, w)) + fine, rtol=0, atol=2e-6)
-        shown = upsample_add_triton(Pyramid(grid), coarse, fine, clamped=True)
-        torch.testing.assert_close(shown, expected.clamp(0, 1), rtol=0, atol=2e-6)
-        leaf = fine.clone().requires_grad_()
-        by_fine = torch.autograd.grad((upsample_add_triton(Pyramid(grid), coarse, leaf) * expected).sum(), leaf)
-        assert (by_fine[0] == expected).all()
-        gradients = []
-        adding = lambda image, size: upsample_add_triton(Pyramid(grid), image, fine)
-        for up in (Pyramid(grid).up, lambda *given: upsample_triton(Pyramid(grid), *given), adding):
-            leaf = coarse.clone().requires_grad_()
-            (up(leaf, (h, w)) * fine).sum().backward()
-            gradients.append(leaf.grad)
-        for found in gradients[1:]:
-            torch.testing.assert_close(found, gradients[0], rtol=0, atol=1e-5)
-"""
 
 
 def images(grid: str, shape: tuple[int, ...], dtype: torch.dtype, device: str = "cpu") -> tuple[torch.Tensor, ...]:
@@ -166,13 +132,6 @@ def test_a_kernel_is_checked_whatever_the_caller_is_doing(
     with mode():
         assert is_used()
     assert _Asking.apply(torch.zeros((), requires_grad=True)) == 1.0  # type: ignore[no-untyped-call]  # torch's
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-def test_the_kernel_of_a_gpu_interpreted() -> None:
-    command = [sys.executable, "-c", TRITON]
-    done = subprocess.run(command, check=False, env=dict(os.environ), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.gpu
