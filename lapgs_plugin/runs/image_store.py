@@ -93,7 +93,7 @@ class _Image:
     low: float
     stored: Tensor | None = None
     path: Path | None = None
-    page_locked: _PageLocked | None = None
+    page_locked: PageLocked | None = None
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class ImageStore:
             stored = torch.empty(encoded.shape, dtype=self._dtype, device=self._device).copy_(encoded)
             torch.cuda.current_stream(self._device).synchronize()  # from now on any stream may read it
         elif self._stream is not None:
-            page_locked = _PageLocked(encoded.nbytes, self._device)
+            page_locked = PageLocked(encoded.nbytes, self._device)
             stored = page_locked.view(encoded.shape, self._dtype).copy_(encoded)
         else:
             stored = torch.empty(encoded.shape, dtype=self._dtype).copy_(encoded)
@@ -353,13 +353,13 @@ class ImageStore:
 
     def _staged(self, image: _Image) -> Tensor:
         """Return page-locked memory of this loader thread for an image from the disk."""
-        page_locked: _PageLocked | None = getattr(self._staging, "page_locked", None)
+        page_locked: PageLocked | None = getattr(self._staging, "page_locked", None)
         if page_locked is None or page_locked.num_bytes < self._num_bytes(image):
-            page_locked = self._staging.page_locked = _PageLocked(self._num_bytes(image), self._device)
+            page_locked = self._staging.page_locked = PageLocked(self._num_bytes(image), self._device)
         return page_locked.view(image.shape, self._dtype)
 
 
-class _PageLocked:
+class PageLocked:
     """Allocate memory that a GPU can copy from by itself while the processor works.
 
     Its pages are registered with the driver. torch's allocator of page-locked memory rounds every size up to a power of

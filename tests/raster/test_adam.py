@@ -104,16 +104,6 @@ def test_equals_torch_adam_for_any_shape(shape: tuple[int, ...], lr: float, eps:
     assert difference_from_torch(shape, 5, torch.float64, lr, eps) < 1e-9  # worst seen: 9e-12
 
 
-def test_column_scale_multiplies_the_learning_rate_of_each_column() -> None:
-    values = list(gradients(SH_SHAPE, 50, torch.float64))
-    scale = sh_scale(torch.float64)
-    ours = descend(FieldAdam([parameter(SH_SHAPE, torch.float64)], lr=1e-2, column_scale=scale), values)
-    for columns, lr in ((slice(0, 1), 1e-2), (slice(1, None), 1e-2 / 20)):
-        part = torch.nn.Parameter(parameter(SH_SHAPE, torch.float64).detach()[:, columns].clone())
-        theirs = descend(torch.optim.Adam([part], lr=lr, eps=1e-15), [value[:, columns] for value in values])
-        torch.testing.assert_close(ours[:, columns], theirs, rtol=0, atol=1e-12 * lr)  # 4.4e-16 seen
-
-
 def test_columns_that_become_active_later_train_as_if_they_always_had_been() -> None:
     """Follow the SH schedule: bands above the current degree have zero gradients until it rises."""
     values = list(gradients(SH_SHAPE, 40, torch.float32))

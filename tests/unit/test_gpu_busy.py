@@ -42,7 +42,7 @@ def run(iterations: int, cost: Callable[[int], float], views: int = 1, first: in
         if busy.due(done):
             busy.step(done)
         taken = min(views, iterations - done)
-        gpu.busy += sum(cost(done + each) for each in range(taken))
+        gpu.busy += sum(cost(done + view) for view in range(taken))
         done += taken
     if busy.due(done):
         busy.step(done)
