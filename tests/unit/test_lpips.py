@@ -119,13 +119,13 @@ def test_distances_are_those_of_torchmetrics(
     metrics = lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 44, CPU)
     assert metrics.missing == {}
     image, target = images()
-    found = metrics.measure(image, target)
-    assert set(found) == ({name, AS_3DGS} if name == "vgg" else {name})
+    distances = metrics.measure(image, target)
+    assert set(distances) == ({name, AS_3DGS} if name == "vgg" else {name})
     expected = reference(name, weights, image, target)
-    assert found[name] == pytest.approx(expected, rel=4e-6)  # float32 against float64; 4e-7 seen
+    assert distances[name] == pytest.approx(expected, rel=4e-6)  # float32 against float64; 4e-7 seen
     if name == "vgg":
         unscaled = reference(name, weights, image, target, rescaled=False)
-        assert found[AS_3DGS] == pytest.approx(unscaled, rel=4e-6)
+        assert distances[AS_3DGS] == pytest.approx(unscaled, rel=4e-6)
         assert abs(unscaled - expected) > 1e-3 * expected  # or the two would not be told apart
 
 
@@ -181,37 +181,27 @@ def test_the_smallest_image_is_measured_and_a_smaller_one_reported(name: str, tm
     assert "too small" in lpips_metrics(request, smallest - 1, CPU).missing[name]
 
 
-def damaged(folder: Path) -> dict[str, Path]:
-    """Make unusable files, by the words of their messages."""
-    files = {name: folder / f"{index}.pth" for index, name in enumerate(("fits none", "cannot be read", "a list"))}
-    torch.save({"features.0.weight": torch.zeros(8, 3, 3, 3)}, files["fits none"])
-    files["cannot be read"].write_bytes(b"PK\x03\x04 cut short")
-    torch.save([1, 2], files["a list"])
-    return {**files, "No such file": folder / "nowhere.safetensors"}
+def test_unusable_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pth"
+    for contents, message in (
+        ({"features.0.weight": torch.zeros(8, 3, 3, 3)}, "weights.pth: fits none.*expected"),
+        ([1, 2], "weights.pth cannot be read .a list.*expected"),
+        (b"PK\x03\x04 cut short", "weights.pth cannot be read .*expected"),
+        (
+            {**random_weights("alex"), "lin2.weight": torch.zeros(1, 5, 1, 1)},
+            r"learned.2 is \(1, 5, 1, 1\), expected \(1, 384, 1, 1\)",
+        ),
+    ):
+        path.write_bytes(contents) if isinstance(contents, bytes) else torch.save(contents, path)
+        with pytest.raises(UserInputError, match=message) as raised:
+            lpips_metrics(LpipsRequest(files=(path,)), 44, CPU)
+        assert "\n" not in str(raised.value)
+    with pytest.raises(UserInputError, match=r"nowhere\.safetensors cannot be read .*No such file"):
+        lpips_metrics(LpipsRequest(files=(tmp_path / "nowhere.safetensors",)), 44, CPU)
 
 
-@pytest.mark.parametrize("said", ["fits none", "cannot be read", "a list", "No such file"])
-def test_unusable_files_are_refused(said: str, tmp_path: Path) -> None:
-    path = damaged(tmp_path)[said]
-    with pytest.raises(UserInputError, match=said) as raised:
-        lpips_metrics(LpipsRequest(files=(path,)), 44, CPU)
-    assert str(path) in str(raised.value)
-    assert "expected" in str(raised.value)
-    assert "\n" not in str(raised.value)
-
-
-def test_learned_layers_of_another_shape(tmp_path: Path) -> None:
-    weights = {**random_weights("alex"), "lin2.weight": torch.zeros(1, 5, 1, 1)}
-    torch.save(weights, tmp_path / "weights.pth")
-    with pytest.raises(UserInputError, match=r"learned.2 is \(1, 5, 1, 1\), expected \(1, 384, 1, 1\)"):
-        lpips_metrics(LpipsRequest(files=(tmp_path / "weights.pth",)), 44, CPU)
-
-
-def test_an_unknown_variant_names_the_known_ones() -> None:
+def test_requests_that_cannot_be_met_are_refused_before_images_are_read(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"--lpips vgg19: expected none, or some of vgg, alex, squeeze, vgg_3dgs"):
         LpipsRequest.parse("alex,vgg19")
-
-
-def test_weights_that_do_not_exist_are_refused_before_images_are_read(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"--lpips-weights .*nowhere\.pth: no such file"):
         LpipsRequest.parse(None, [tmp_path / "nowhere.pth"])

@@ -33,24 +33,23 @@ class Slow(Rasterizer):
 def test_every_kind_is_measured_by_itself() -> None:
     fields = {1: blob_field(30), 0: replace(blob_field(50), signed=True)}
     renderer = HierarchyRenderer(fields, 2, Pyramid(), Slow())
-    found = measure_speed(renderer, [ring_camera(0.0), ring_camera(1.0)], 0, rounds=2)
-    described = [(each.what, each.size, each.gaussians) for each in found]
-    assert described == [
+    speeds = measure_speed(renderer, [ring_camera(0.0), ring_camera(1.0)], 0, rounds=2)
+    assert [(kind.what, kind.size, kind.gaussians) for kind in speeds] == [
         ("levels 1 to 0, one after the other", (56, 40), 80),
         ("base", (28, 20), 30),
         ("base as large as level 0", (56, 40), 30),
         ("residual 0 alone", (56, 40), 50),
     ]
-    for each, seconds in zip(found, (0.008, 0.002, 0.002, 0.006), strict=True):
-        assert each.milliseconds >= 1000 * seconds
-        assert each.fps == pytest.approx(1000 / each.milliseconds)
-    assert [each.what for each in measure_speed(renderer, [ring_camera(0.0)], 1, rounds=1)] == ["base"]
+    for kind, seconds in zip(speeds, (0.008, 0.002, 0.002, 0.006), strict=True):
+        assert kind.milliseconds >= 1000 * seconds
+        assert kind.fps == pytest.approx(1000 / kind.milliseconds)
+    assert [kind.what for kind in measure_speed(renderer, [ring_camera(0.0)], 1, rounds=1)] == ["base"]
 
 
 def test_of_nested_levels_each_is_a_field() -> None:
     renderer = HierarchyRenderer({1: blob_field(30), 0: blob_field(50)}, 2, Pyramid(), CpuRasterizer())
-    found = measure_speed(renderer, [ring_camera(0.0), ring_camera(1.0)], 0, rounds=1)
-    assert [(each.what, each.size, each.gaussians) for each in found] == [
+    speeds = measure_speed(renderer, [ring_camera(0.0), ring_camera(1.0)], 0, rounds=1)
+    assert [(kind.what, kind.size, kind.gaussians) for kind in speeds] == [
         ("level 0", (56, 40), 50),
         ("base", (28, 20), 30),
         ("base as large as level 0", (56, 40), 30),

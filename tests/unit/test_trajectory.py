@@ -1,4 +1,4 @@
-"""Compare camera paths with known circles and cameras, and refuse files with mistakes."""
+"""Compare rigs and camera paths with known circles and cameras, and refuse files with mistakes."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from tests.training_scene import ring_camera
 
 
 def ring(count: int, angle: float = 2 * math.pi) -> list[Camera]:
+    """Return cameras of `ring_camera`: 4 from the y axis at y = -1, looking at the origin; y points down."""
     return [ring_camera(angle * i / count) for i in range(count)]
 
 
@@ -30,6 +31,29 @@ def turns(cameras: list[Camera]) -> NDArray[np.float64]:
     """Return the angle between each camera and the next in radians."""
     rotations = Rotation.from_matrix([camera.world_to_camera[:3, :3].double().numpy() for camera in cameras])
     return np.asarray((rotations[1:] * rotations[:-1].inv()).magnitude())
+
+
+def test_a_ring_looks_at_its_centre() -> None:
+    rig = Rig.of(ring(12))
+    np.testing.assert_allclose(rig.focus, 0.0, atol=5e-3)  # worst seen 3e-3: the ridge draws it to the guess
+    np.testing.assert_allclose(rig.up, [0.0, -1.0, 0.0], atol=1e-6)
+    assert rig.distance == pytest.approx(math.sqrt(17.0), rel=2e-3)
+    assert rig.surrounds
+
+
+def test_cameras_on_one_side_do_not_surround() -> None:
+    rig = Rig.of(ring(8, angle=1.0))
+    assert not rig.surrounds
+    np.testing.assert_allclose(rig.focus, 0.0, atol=0.05)
+
+
+def test_one_camera_looks_somewhere_ahead() -> None:
+    camera = ring_camera(0.3)
+    rig = Rig.of([camera])
+    ahead = rig.focus - camera.position.double().numpy()
+    np.testing.assert_allclose(ahead / np.linalg.norm(ahead), forward(camera), atol=1e-6)
+    assert rig.distance > 0.5
+    assert not rig.surrounds
 
 
 def test_an_orbit_of_a_ring_is_that_ring() -> None:
@@ -140,49 +164,43 @@ GOOD: dict[str, Any] = {"w": 64, "h": 48, "fl_x": 50.0}
 EYE = np.eye(4).tolist()
 
 
+def of_frames(*frames: Any, **intrinsics: Any) -> dict[str, Any]:
+    values = {**GOOD, **intrinsics, "frames": frames}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def with_matrix(matrix: Any = EYE, **intrinsics: Any) -> dict[str, Any]:
+    return of_frames({"transform_matrix": np.asarray(matrix, dtype=object).tolist()}, **intrinsics)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         ([], "no cameras in it"),
-        ({**GOOD, "frames": []}, "no cameras in it"),
-        ({**GOOD, "frames": [{"transform_matrix": EYE}, {}]}, "frame 1 has no transform_matrix"),
-        ({"w": 64, "fl_x": 50.0, "frames": [{"transform_matrix": EYE}]}, "frame 0 has no h, expected w and h"),
-        ({"w": 64, "h": 48, "frames": [{"transform_matrix": EYE}]}, "frame 0 has neither fl_x nor camera_angle_x"),
-        ({**GOOD, "frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}, "no transform_matrix of 4x4 finite numbers"),
-        ({**GOOD, "frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "is no rotation and translation"),
-        ({**GOOD, "frames": [{"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "is no rotation and"),
+        (of_frames(), "no cameras in it"),
+        (of_frames({"transform_matrix": EYE}, {}), "frame 1 has no transform_matrix"),
+        (of_frames({"transform_matrix": EYE}, h=None), "frame 0 has no h, expected w and h"),
+        (of_frames({"transform_matrix": EYE}, fl_x=None), "frame 0 has neither fl_x nor camera_angle_x"),
+        (with_matrix([[1, 0], [0, 1]]), "no transform_matrix of 4x4 finite numbers"),
+        (with_matrix(2 * np.eye(4)), "is no rotation and translation"),
+        (with_matrix(np.diag([1, 1, -1, 1])), "is no rotation and"),
+        (with_matrix([*EYE[:3], [0, 0, 0, 2]]), "frame 0 has 0 0 0 2 in the last row of .*, expected 0 0 0 1; export"),
+        (with_matrix([*EYE[:3], [1.5, -2, 3, 1]]), "frame 0 has 1.5 -2 3 1 in the last row"),  # by columns
+        (with_matrix([[math.nan] * 4] * 4), "of 4x4 finite numbers"),
+        (with_matrix(fl_x=None, camera_angle_x=0), "frame 0 has intrinsics that"),
+        (with_matrix(w=math.inf), "frame 0 has intrinsics that are"),
+        (with_matrix(fl_x=-3), "focal lengths -3 and -3"),
+        (with_matrix(w="wide"), r"are no numbers \(invalid literal"),
+        (of_frames("here"), "frame 0 is 'here', expected a table"),
         (
-            {**GOOD, "frames": [{"transform_matrix": [*EYE[:3], [0, 0, 0, 2]]}]},
-            "frame 0 has 0 0 0 2 in the last row of its transform_matrix, expected 0 0 0 1; export the matrix by rows",
-        ),
-        (
-            {**GOOD, "frames": [{"transform_matrix": [*EYE[:3], [1.5, -2, 3, 1]]}]},  # by columns
-            "frame 0 has 1.5 -2 3 1 in the last row",
-        ),
-        ({**GOOD, "frames": [{"transform_matrix": [[math.nan] * 4] * 4}]}, "of 4x4 finite numbers"),
-        ({"w": 64, "h": 48, "camera_angle_x": 0, "frames": [{"transform_matrix": EYE}]}, "frame 0 has intrinsics that"),
-        ({**GOOD, "w": math.inf, "frames": [{"transform_matrix": EYE}]}, "frame 0 has intrinsics that are"),
-        ({**GOOD, "fl_x": -3, "frames": [{"transform_matrix": EYE}]}, "focal lengths -3 and -3"),
-        (
-            {**GOOD, "w": "wide", "frames": [{"transform_matrix": EYE}]},
-            r"are no numbers \(invalid literal",
-        ),
-        ({**GOOD, "frames": ["here"]}, "frame 0 is 'here', expected a table"),
-        (
-            {**GOOD, "w": 10**5, "h": 10**5, "fl_x": 1e5, "frames": [{"transform_matrix": EYE}]},
+            with_matrix(w=10**5, h=10**5, fl_x=1e5),
             "frame 0 has 100000x100000 pixels, expected at most 128,000,000 pixels; .* LAPGS_MAX_VIEW_PIXELS",
         ),
-        (
-            {**GOOD, "w": 10**300, "fl_x": 1e300, "frames": [{"transform_matrix": EYE}]},
-            "holds the number of 997 bits, expected 64 bits at most",
-        ),
-        ({**GOOD, "fl_x": 1e300, "frames": [{"transform_matrix": EYE}]}, "focal lengths 1e.300"),
-        ({**GOOD, "cx": -1e300, "frames": [{"transform_matrix": EYE}]}, r"principal point \(-1e.300, 24\)"),
-        ({**GOOD, "frames": [{"transform_matrix": (1e300 * np.eye(4)).tolist()}]}, "1e.300 in its transform_matrix"),
-        (
-            {**GOOD, "frames": [{"transform_matrix": [[10**400] * 4] * 4}]},
-            "holds the number of 1329 bits, expected 64 bits at most",
-        ),
+        (with_matrix(w=10**300, fl_x=1e300), "holds the number of 997 bits, expected 64 bits at most"),
+        (with_matrix(fl_x=1e300), "focal lengths 1e.300"),
+        (with_matrix(cx=-1e300), r"principal point \(-1e.300, 24\)"),
+        (with_matrix(1e300 * np.eye(4)), "1e.300 in its transform_matrix"),
+        (with_matrix([[10**400] * 4] * 4), "holds the number of 1329 bits, expected 64 bits at most"),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_the_frame(values: object, message: str, tmp_path: Path) -> None:
@@ -195,7 +213,7 @@ def test_a_bad_file_is_one_line_that_names_the_frame(values: object, message: st
 
 def test_a_file_of_too_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "path.json"
-    path.write_text(json.dumps({**GOOD, "frames": [{"transform_matrix": EYE}] * 4}))
+    path.write_text(json.dumps(of_frames(*[{"transform_matrix": EYE}] * 4)))
     monkeypatch.setenv("LAPGS_MAX_FRAMES", "3")
     with pytest.raises(
         UserInputError, match=r"path\.json has 4 frames, expected at most 3 frames; .* LAPGS_MAX_FRAMES"
