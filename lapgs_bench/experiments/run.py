@@ -57,7 +57,7 @@ class RunsFailedError(LapgsError):
 def run_experiment(file: Path, settings: BenchSettings) -> None:
     """Run an experiment as the help of `lapgs bench EXPERIMENT` says."""
     file = experiment_file(file)
-    experiment = load_experiment(file, _option_names())
+    experiment = load_experiment(file, option_names())
     mistakes = Mistakes(file, experiment, settings.selection)
     with mistakes.at("table"):
         check_table(experiment)
@@ -84,7 +84,7 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
     _write(experiment, planned, folder)
 
 
-def _option_names() -> dict[str, set[str]]:
+def option_names() -> dict[str, set[str]]:
     """Return the options that an experiment may set, by command."""
     return {
         name: {p for p in function.__annotations__ if p not in ("return", "context")} - SET_BY_EXPERIMENTS

@@ -181,7 +181,7 @@ def machine() -> dict[str, str | int]:
     }
 
 
-class _Contender:
+class Contender:
     """Train an implementation's own copy of the parameters."""
 
     def __init__(
@@ -228,8 +228,8 @@ class _Contender:
         return dict(zip(("forward", "loss", "backward", "adam"), spans, strict=True))
 
 
-def _fast(scene: BenchScene) -> _Contender:
-    return _Contender(
+def _fast(scene: BenchScene) -> Contender:
+    return Contender(
         CpuRasterizer(), photometric_loss_cpu, lambda p: FieldAdam([p], lr=LEARNING_RATE), scene, threads=one_pool
     )
 
@@ -239,17 +239,17 @@ def contender_names(dtype: torch.dtype) -> list[str]:
     return [FAST, ORACLE, *([GSPLAT] if dtype == torch.float32 else [])]
 
 
-def _contenders(scene: BenchScene) -> dict[str, _Contender]:
+def make_contenders(scene: BenchScene) -> dict[str, Contender]:
     """Make the contenders of `contender_names`."""
 
     def torch_adam(parameter: Tensor) -> torch.optim.Optimizer:
         return torch.optim.Adam([parameter], lr=LEARNING_RATE, eps=ADAM_EPS)
 
-    contenders = {FAST: _fast(scene), ORACLE: _Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
+    contenders = {FAST: _fast(scene), ORACLE: Contender(OracleRasterizer(), photometric_loss_torch, torch_adam, scene)}
     if GSPLAT in contender_names(scene.target.dtype):
         from lapgs_bench.kernels.gsplat_on_cpu import GsplatTorchRasterizer
 
-        contenders[GSPLAT] = _Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
+        contenders[GSPLAT] = Contender(GsplatTorchRasterizer(), photometric_loss_torch, torch_adam, scene)
     return contenders
 
 
@@ -275,7 +275,7 @@ def run_case(
         advance: called after each turn with the contender's name.
     """
     scene = make_scene(case.width, case.height, case.gaussians, dtype)
-    contenders = _contenders(scene)
+    contenders = make_contenders(scene)
     timed: dict[str, list[dict[str, float]]] = {name: [] for name in contenders}
     tile_loops = []
     contenders[FAST].iteration()
@@ -301,7 +301,7 @@ def run_case(
     )
 
 
-def _parts(fast: _Contender, repeats: int) -> dict[str, float]:
+def _parts(fast: Contender, repeats: int) -> dict[str, float]:
     """Measure the parts of the fast contender's iteration, in milliseconds."""
     runs = []
     for _ in range(repeats):

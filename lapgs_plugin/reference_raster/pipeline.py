@@ -159,7 +159,7 @@ def render(
         view.camera, tiles_x, tiles_y, splats, boxes, radii, depths, centres,
     )  # fmt: skip
     if assign is None:
-        first_pair, places, tile_start, members = _order(n, boxes, depths, tiles_x, tiles_x * tiles_y)
+        first_pair, places, tile_start, members = list_tiles(n, boxes, depths, tiles_x, tiles_x * tiles_y)
     else:
         first_pair, places, tile_start, members = assign(splats, radii[:n])
 
@@ -251,7 +251,7 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Float
     return means, quats, scales, gaussians.opacities, sh, colors, gaussians.columns
 
 
-def _order(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int) -> TileLists:
+def list_tiles(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int) -> TileLists:
     """List the splats of each tile, front to back; see `ordering_kernels`."""
     first_pair = empty(n + 1, np.int64)
     shown = ordering_kernels.count_pairs(n, boxes, first_pair)

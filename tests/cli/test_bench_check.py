@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
-from lapgs_bench.experiments import checks, run
-from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments import run
+from lapgs_bench.experiments.run import option_names
 from lapgs_bench.experiments.schema import load_experiment
 from lapgs_bench.experiments.standard import EXPERIMENTS
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import LapgsError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.contract.stub_runs import CHECKOUTS
 
@@ -95,6 +97,15 @@ def lines_about(text: str, *words: str) -> list[str]:
     return str(result.exception).split("\n")
 
 
+def commands_of(text: str) -> str:
+    """Return the commands that `lapgs bench` prints of an experiment without mistakes."""
+    Path("tiny.toml").write_text(text)
+    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
+    return result.stdout
+
+
 def everything() -> set[str]:
     return {path.as_posix() for path in Path().rglob("*")}
 
@@ -102,7 +113,6 @@ def everything() -> set[str]:
 MISTAKES = [
     ("seeds = [0, 1]", "seeds = [0, -1]", ["seeds.1 = -1", "expected 0 to 4294967295"]),
     ("seeds = [0, 1]", "seeds = [3, 3]", ["seeds", "3 is listed twice", "expected different seeds"]),
-    ("seeds = [0, 1]", 'seeds = ["one"]', ["seeds.0 = 'one'", "valid integer"]),
     ("levels = 2", "levels = 0", ["variants.1.options.levels = 0"]),
     ("levels = 2", "levels = 99", ["variants.1.options.levels = 99", "would be 1x1 pixels, expected at least 16"]),
     ("levels = 2", "levels = 3", ["variants.1.options.levels = 3", "12x8 pixels, expected at least 16"]),
@@ -146,10 +156,8 @@ MISTAKES = [
     (PATH, SAMPLE.replace("64x48", "20x20"), ["variants.1.options.levels = 2", "10x10 pixels"]),
     (PATH, SAMPLE.replace("views = 8", "views = -1"), ["scenes.0.sample.views = -1", "greater than or equal to 2"]),
     (PATH, SAMPLE.replace("100", "1000000000000"), ["--points 1000000000000: expected at most 1000000"]),
-    ("iterations = 20", "iterations = -5", ["iterations = -5", "greater than or equal to 1"]),
     ("iterations = 20", "iterations = 1", ["iterations = 1", "at least one for each of the 2 levels"]),
     ('name = "mine"', f'name = "{"n" * 240}"', ["a run called nnnn", "expected at most 230"]),
-    ('name = "both"', 'name = "bare"', ["variants", "two variants are called 'bare'"]),
     ('title = "Tiny"', 'title = "Tiny"\n[table]\ncolumns = ["psrn"]', ["table", "'psrn' is not known"]),
 ]
 
@@ -165,9 +173,9 @@ def test_a_mistake_is_one_line_that_names_file_key_value_and_what_was_expected(
     lines = lines_about(text)
     # Two commands may use their own words, and a scene is named for each variant that cannot use it.
     assert all(line.startswith("tiny.toml: ") and line.isprintable() for line in lines)
-    (line, *_) = [each for each in lines if all(word in each for word in expected)] or [None]
+    (line, *_) = [one for one in lines if all(word in one for word in expected)] or [None]
     assert line is not None, lines
-    assert all(each.split(": ")[1] == line.split(": ")[1] or expected[-1] in each for each in lines), lines
+    assert all(one.split(": ")[1] == line.split(": ")[1] or expected[-1] in one for one in lines), lines
 
 
 def test_every_mistake_is_said_once_and_all_at_once() -> None:
@@ -241,10 +249,7 @@ def test_options_of_ray_are_numbers(name: str, value: str, monkeypatch: pytest.M
 
 def test_defaults_of_residual_options_are_accepted_for_nested_levels() -> None:
     idle = f'{NESTED}, joint = 0.0, supervision = "reconstructed"'
-    Path("tiny.toml").write_text(GOOD.replace("sh_degree = 1", idle))
-    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.exception
+    assert commands_of(GOOD.replace("sh_degree = 1", idle))
 
 
 def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,36 +261,16 @@ def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.Monkey
         'backbones.cpu.rasterizer = "gsplat"',
         'variants.3.options.device = "cuda"',
     ]
-    Path("tiny.toml").write_text(text)
-    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.exception
-    assert result.stdout.count("\n# ") + 1 == 10, "two seeds of five runs"
-
-
-def test_the_commands_that_are_checked_are_those_that_are_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every run is rehearsed."""
-    checked = []
-    real = checks._rehearse
-
-    def noting(job: object, check: object) -> None:
-        checked.append(job)
-        real(job, check)  # type: ignore[arg-type]  # passed through
-
-    monkeypatch.setattr(checks, "_rehearse", noting)
-    Path("tiny.toml").write_text(GOOD)
-    words = ["bench", "tiny.toml", "--no-eval", "--dry-run", "--path", f"fastgs={CHECKOUTS / 'fastgs'}"]
-    printed = CliRunner().invoke(app, words).stdout
-    assert len(checked) == 10
-    assert [line[2:] for line in printed.splitlines() if line.startswith("# ")] == [job.run_id for job in checked]
+    assert commands_of(text).count("\n# ") + 1 == 10, "two seeds of five runs"
 
 
 def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = place / "scene"
-    monkeypatch.setattr(checks, "_smallest_size", lambda scene, folder, resolution: (1600, 1066))
+    camera = Camera(1600, 1066, 1600.0, 1600.0, 800.0, 533.0, torch.eye(4))
+    monkeypatch.setattr("lapgs_plugin.scenes.scene.load_cameras", lambda *_, **__: ({"0.jpg": camera}, {}))
     for shipped, path in EXPERIMENTS.items():
-        experiment = load_experiment(path, _option_names())
+        experiment = load_experiment(path, option_names())
         names = {name for entry in experiment.scenes for name in entry.names}
         for name in names:
             link = place / "links" / name

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import shutil
 import signal
 import subprocess
@@ -15,11 +14,11 @@ from typer.testing import CliRunner
 
 from lapgs_bench.app import app
 from lapgs_bench.experiments.expansion import plan_runs
-from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.run import option_names
 from lapgs_bench.experiments.schema import load_experiment
 from lapgs_bench.experiments.settings import Selection
 from lapgs_bench.experiments.store import DONE, FAILED, Job, ResultStore
-from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.waiting import wait_for
 
@@ -98,7 +97,7 @@ def test_a_run_that_fails_is_reported_and_a_finished_one_never_repeated(experime
     assert Path(row["folder"], "manifest.json").stat().st_mtime_ns == written
     with (out / "results.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [each["scene"] for each in rows] == ["mine", "torn"]
+    assert [one["scene"] for one in rows] == ["mine", "torn"]
 
 
 @pytest.mark.slow
@@ -125,23 +124,9 @@ def test_killed_in_the_middle_two_others_go_on_and_share_the_work(experiment: Pa
         assert len(list(csv.DictReader(stream))) == 2
 
 
-def invoke(*words: str | Path) -> BaseException | None:
-    return CliRunner().invoke(app, [str(word) for word in words]).exception
-
-
-def test_a_missing_scene_or_checkout_stops_before_anything_runs(experiment: Path) -> None:
-    text = EXPERIMENT.replace('rasterizer = "cpu"', 'checkout = "fastgs"').replace(", sh_degree = 1", "")
-    experiment.write_text(text)
-    os.environ.pop("LAPGS_FASTGS", None)
-    error = invoke(experiment, "--out", experiment.parent / "out")
-    assert isinstance(error, UserInputError)
-    assert "checkout fastgs: its folder is not given; give --path fastgs=FOLDER (LAPGS_FASTGS)" in str(error)
-    assert not (experiment.parent / "out").exists()
-
-
 def test_results_of_another_version_are_named(experiment: Path) -> None:
     out = experiment.parent / "out"
-    planned = plan_runs(load_experiment(experiment, _option_names()), Selection())
+    planned = plan_runs(load_experiment(experiment, option_names()), Selection())
     store = ResultStore.create(out / "results.sqlite")
     store.plan([Job(run.spec.run_id, run.spec, "", "", (), True, "{}") for run in planned])
     claim = store.claim([planned[0].spec.run_id])
@@ -161,7 +146,9 @@ def test_results_of_another_version_are_named(experiment: Path) -> None:
 
 
 def test_tables_of_nothing(experiment: Path) -> None:
-    error = invoke(experiment, "--out", experiment.parent / "out", "--tables-only")
+    error = (
+        CliRunner().invoke(app, [str(experiment), "--out", str(experiment.parent / "out"), "--tables-only"]).exception
+    )
     assert isinstance(error, RunFolderError)
     assert "does not exist" in str(error)
 

@@ -14,8 +14,8 @@ SMALL = ("--device", "cpu", "--width", 36, "--height", 24, "--gaussians", 50, "-
 
 
 def test_every_version_gives_what_pytorch_gives() -> None:
-    found = benchmark(torch.device("cpu"), 36, 24, 50, 1)
-    versions = {(time.op, time.version): time.difference for time in found}
+    times = benchmark(torch.device("cpu"), 36, 24, 50, 1)
+    versions = {(time.op, time.version): time.difference for time in times}
     assert {op for op, _ in versions} == {
         "upsample", "photometric loss", "Adam", "densification statistics", "colour transform", "residual's loss",
         "regularization", "position noise",
@@ -25,8 +25,8 @@ def test_every_version_gives_what_pytorch_gives() -> None:
         assert versions[op, "Numba"] < 2e-5
     assert versions["upsample", "kornia.pyrup"] < 2e-5
     assert versions["Adam", "torch.optim.Adam"] < 2e-5
-    assert all(time.ratio == 1 for time in found if time.version == TORCH)
-    assert all(time.milliseconds > 0 for time in found)
+    assert all(time.ratio == 1 for time in times if time.version == TORCH)
+    assert all(time.milliseconds > 0 for time in times)
 
 
 def test_sides_that_kornia_cannot_double_leave_it_out() -> None:

@@ -57,10 +57,10 @@ def write_experiment(folder: Path) -> Path:
     """Write the folder of an experiment with all its runs, one of them without metrics."""
     scene = write_scene(folder / "scenes" / "striped")
     rows = [row(s, b, v, seed) for seed in SEEDS for s in SCENES for b in BACKBONES for v in VARIANTS]
-    for each in rows:
-        if each["seed"] == 0:
-            run = write_run(folder / "runs" / Path(each["folder"]).name, scene, levels=VARIANTS[each["variant"]])
-            if each["run"] != "1-fastgs-1-0":
+    for one in rows:
+        if one["seed"] == 0:
+            run = write_run(folder / "runs" / Path(one["folder"]).name, scene, levels=VARIANTS[one["variant"]])
+            if one["run"] != "1-fastgs-1-0":
                 evaluate_run(RunArchive.open(run))
     write_csv(folder / "results.csv", rows)
     write_text(folder / "tables.md", "# A trial\n\nMeans.\n\n|  | PSNR |\n| --- | --- |\n| <i>bare</i> | 27.0 |\n")
@@ -100,13 +100,13 @@ def test_arrows_lead_from_bare_to_the_hierarchy_in_means_over_seeds(experiment: 
     text = (experiment / "report.html").read_text()
     assert "Optimization (s) against Gaussians over Gaussians of levels, weighted by iterations" in text
     drawn = re.findall(r'<g class="(.*?)"><title>(.*?)</title>\s*<circle cx="(.*?)" cy="(.*?)"', text)
-    assert [each[:2] for each in drawn] == [
+    assert [arrow[:2] for arrow in drawn] == [
         ("line-variant-1 dot-variant-1", f"{s}, {b}: bare to two levels")
         for s in ("garden", "&lt;b&gt;attic&lt;/b&gt;")
         for b in BACKBONES
     ]
     # Starts lie where the means over both seeds are: 1005, 2005, 2005 and 4005 Gaussians; 10.5, 20.5, 20.5, 40.5 s.
-    xs, ys = ([float(each[i]) for each in drawn] for i in (2, 3))
+    xs, ys = ([float(arrow[i]) for arrow in drawn] for i in (2, 3))
     assert (xs[3] - xs[0]) / (xs[1] - xs[0]) == pytest.approx(3.0, abs=0.01)  # 0.0012 seen
     assert (ys[0] - ys[3]) / (ys[0] - ys[1]) == pytest.approx(3.0, abs=0.01)  # 8.9e-16 seen
     assert (xs[1], ys[1]) == (xs[2], ys[2])

@@ -12,12 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from lapgs_bench.experiments import commands
-from lapgs_bench.experiments.commands import Locations, run_steps
+from lapgs_bench.experiments.commands import Locations, Step, run_steps
 from lapgs_bench.experiments.execution import prepare
 from lapgs_bench.experiments.expansion import plan_runs, scenes_of
 from lapgs_bench.experiments.mistakes import Mistakes
-from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.run import option_names
 from lapgs_bench.experiments.schema import Experiment
 from lapgs_bench.experiments.settings import Selection
 from lapgs_bench.experiments.standard import PRESETS
@@ -47,25 +46,17 @@ def test_every_combination_once_and_variants_in_turn(
         variants=[{"name": f"v{i}", "options": {"levels": i}} for i in range(variants)],
     )
     planned = plan_runs(built, Selection())
-    found = [(run.spec.seed, run.spec.scene, run.variant, run.spec.backbone) for run in planned]
-    wanted = set(
-        product(
-            seeds,
-            (f"s{i}" for i in range(scenes)),
-            (f"v{i}" for i in range(variants)),
-            (f"b{i}" for i in range(backbones)),
-        )
-    )
-    assert len(found) == len(wanted)
-    assert set(found) == wanted
-    assert len({run.spec.run_id for run in planned}) == len(wanted)
+    runs = [(run.spec.seed, run.spec.scene, run.variant, run.spec.backbone) for run in planned]
+    names = ([f"{letter}{i}" for i in range(n)] for letter, n in (("s", scenes), ("v", variants), ("b", backbones)))
+    assert sorted(runs) == sorted(product(seeds, *names))
+    assert len({run.spec.run_id for run in planned}) == len(runs)
     # No variant runs twice in the same position before every other one did.
     pairs = variants * backbones
-    for start in range(0, len(found), pairs):
-        block = found[start : start + pairs]
+    for start in range(0, len(runs), pairs):
+        block = runs[start : start + pairs]
         assert len({(seed, scene) for seed, scene, _, _ in block}) == 1
-    order = [(variant, backbone) for _, _, variant, backbone in found[:pairs]]
-    beginnings = [(variant, backbone) for _, _, variant, backbone in found[::pairs]]
+    order = [(variant, backbone) for _, _, variant, backbone in runs[:pairs]]
+    beginnings = [(variant, backbone) for _, _, variant, backbone in runs[::pairs]]
     assert beginnings == [order[i % pairs] for i in range(len(beginnings))]
 
 
@@ -92,8 +83,8 @@ def test_a_run_says_which_hierarchy_it_trains() -> None:
     planned = plan_runs(experiment(variants=variants), Selection(scenes=["a"], seeds="0"))
     for backbone in ("cpu", "fast"):
         specs = {run.variant: run.spec for run in planned if run.spec.backbone == backbone}
-        found = {name: spec.options["hierarchy"] for name, spec in specs.items()}
-        assert found == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
+        kinds = {name: spec.options["hierarchy"] for name, spec in specs.items()}
+        assert kinds == {"nested": "nested", "default": "laplacian", "residuals": "laplacian"}
         assert specs["residuals"].run_id == specs["default"].run_id != specs["nested"].run_id
 
 
@@ -103,11 +94,11 @@ def test_another_sample_scene_is_trained_anew_in_a_folder_of_its_own(tmp_path: P
         changed = experiment(scenes=[{"name": "a", "sample": {"size": "64x48", "views": views}}])
         planned = plan_runs(changed, Selection(seeds="0", backbones=["cpu"], variants=["bare"]))
         mistakes, places = Mistakes(tmp_path / "x.toml", changed, Selection()), Locations({}, tmp_path)
-        jobs, found = prepare(planned, scenes_of(changed, Selection()), places, tmp_path, None, mistakes)
+        jobs, scenes = prepare(planned, scenes_of(changed, Selection()), places, tmp_path, None, mistakes)
         mistakes.refuse()
         ids.add(jobs[0].run_id)
-        folders.add(found["a"][1])
-        assert str(found["a"][1]) in jobs[0].steps[0].command
+        folders.add(scenes["a"][1])
+        assert str(scenes["a"][1]) in jobs[0].steps[0].command
     assert len(ids) == len(folders) == 2
 
 
@@ -169,29 +160,35 @@ def test_commands_of_the_built_in_trainer(tmp_path: Path) -> None:
 def test_experiments_choose_hooks(tmp_path: Path, checkout: str | None) -> None:
     (scene := tmp_path / "scene" / "images").mkdir(parents=True)
     Image.new("RGB", (64, 48)).save(scene / "0.jpg")
-    assert all("hooks" in names for names in _option_names().values()), "experiment files may set it"
+    assert all("hooks" in names for names in option_names().values()), "experiment files may set it"
     spec = run_spec(checkout=checkout, rasterizer=None if checkout else "cpu", options={"hooks": "none"})
     step = run_steps(spec, scene.parent, tmp_path, tmp_path / "r", None)[0]
     assert words_after(step.command, "--hooks") == ["none"]
 
 
 @pytest.mark.parametrize("command", ["train", "run"])
-def test_flags_on_and_off_are_words_that_the_command_knows(command: str) -> None:
+def test_flags_on_and_off_are_words_that_the_command_knows(command: str, tmp_path: Path) -> None:
     parameters = typer.main.get_command(app).commands[command].params
-    allowed = _option_names()[command]
+    allowed = option_names()[command]
     flags = [option for option in parameters if option.name in allowed and getattr(option, "is_flag", False)]
     assert flags
+    checkout = "fastgs" if command == "run" else None
+
+    def words(**options: bool) -> list[str]:
+        spec = run_spec(checkout=checkout, rasterizer=None if checkout else "cpu", options=options, resolution="1/2")
+        steps = run_steps(spec, tmp_path, tmp_path if checkout else None, tmp_path / "r", None)
+        return list(steps[0].command)
+
     for flag in flags:
-        assert commands._as_options({flag.name: True}) == [flag.opts[0]]
-        assert commands._as_options({flag.name: False}) == flag.secondary_opts
+        assert [word for word in words(**{flag.name: True}) if word not in words()] == [flag.opts[0]]
+        assert [word for word in words(**{flag.name: False}) if word not in words()] == flag.secondary_opts
 
 
 def test_commands_of_a_checkout(tmp_path: Path) -> None:
     spec = run_spec(checkout="fastgs", rasterizer=None, iterations=7000, arguments=["--mult", "0.7", "--dense", "0.1"])
     (scene := tmp_path / "scene" / "images").mkdir(parents=True)
     Image.new("RGB", (640, 480)).save(scene / "0.jpg")
-    place = scene.parent
-    (step, _) = run_steps(spec, place, tmp_path, tmp_path / "r", [])
+    (step, _) = run_steps(spec, scene.parent, tmp_path, tmp_path / "r", [])
     script = step.command.index(str(tmp_path / "train.py"))
     before, after = step.command[:script], step.command[script:]
     assert "--levels" in before
@@ -203,20 +200,17 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
     ]
     assert after.index("--dense") > after.index("--densify_until_iter"), "the experiment's own words win"
 
-    training, importing, _ = run_steps(
-        run_spec(
-            checkout="fastgs",
-            rasterizer=None,
-            method="bare",
-            options={"gpu_busy": True},
-            arguments=["--mult", "0.7"],
-            iterations=30_000,
-        ),
-        *(place, tmp_path, tmp_path / "r", []),
-    )
+    training, importing, _ = bare_steps(tmp_path, ["--mult", "0.7"], options={"gpu_busy": True})
     assert training.command[3:9] == ("run", "--off", "--record", "--seed", "0", "--gpu-busy")
     assert "--iterations" not in training.command, "30,000 is what the script does by itself"
     assert words_after(importing.command, "--set", "--out") == ["mult=0.7", str(tmp_path / "r" / "lapgs")]
+
+
+def bare_steps(folder: Path, arguments: list[str], **changes: Any) -> list[Step]:
+    """Return the steps of a checkout's script by itself, evaluated."""
+    spec = {"method": "bare", "resolution": "1/2", "iterations": 30_000, "options": {}, **changes}
+    run = run_spec(checkout="fastgs", rasterizer=None, arguments=arguments, **spec)
+    return run_steps(run, folder / "scene", folder, folder / "r", [])
 
 
 @pytest.mark.parametrize(
@@ -230,8 +224,11 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
         (["--dense", "mult"], []),
     ],
 )
-def test_arguments_that_change_how_a_field_is_rendered(arguments: list[str], expected: list[str]) -> None:
-    assert commands._raster_options(arguments) == expected
+def test_arguments_that_change_how_a_field_is_rendered(
+    arguments: list[str], expected: list[str], tmp_path: Path
+) -> None:
+    importing = bare_steps(tmp_path, arguments)[1].command
+    assert list(importing[importing.index("--overwrite") + 1 :]) == expected
 
 
 @pytest.mark.parametrize(

@@ -38,9 +38,9 @@ def order(
 
 
 def run_all(order: WorkOrder, start: Callable[[], Launcher]) -> list[Outcome]:
-    said: list[Outcome] = []
-    outcomes = execute(ResultStore(order.store), order.run_ids, start, said.append)
-    assert sorted(each.run_id for each in said) == sorted(order.run_ids), "each is told of once"
+    ended: list[Outcome] = []
+    outcomes = execute(ResultStore(order.store), order.run_ids, start, ended.append)
+    assert sorted(outcome.run_id for outcome in ended) == sorted(order.run_ids), "each ends once"
     return outcomes
 
 
@@ -134,9 +134,9 @@ def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -
         ray.shutdown()
     assert killed
     assert [outcome.state for outcome in outcomes] == [DONE] * 6
-    found = starts(tmp_path)
-    assert set(found) == set(work_order.run_ids)
-    assert sum(found.values()) <= 7, "the killed one's run alone was started twice"
+    started = starts(tmp_path)
+    assert set(started) == set(work_order.run_ids)
+    assert sum(started.values()) <= 7, "the killed one's run alone was started twice"
 
 
 def _worker_of_a_running_command(noted: Path) -> int:

@@ -9,7 +9,7 @@ import pytest
 
 from lapgs_bench.experiments.aggregate import check_table
 from lapgs_bench.experiments.expansion import plan_runs
-from lapgs_bench.experiments.run import _option_names
+from lapgs_bench.experiments.run import option_names
 from lapgs_bench.experiments.schema import load_experiment
 from lapgs_bench.experiments.settings import Selection
 from lapgs_bench.experiments.standard import EXPERIMENTS
@@ -34,7 +34,7 @@ options = { levels = 1 }
 def load(tmp_path: Path, text: str) -> Any:
     path = tmp_path / "x.toml"
     path.write_text(text)
-    return load_experiment(path, _option_names())
+    return load_experiment(path, option_names())
 
 
 def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_mistake_is_one_line_that_names_it(tmp_path: Path, old: str, new: str,
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"none\.toml cannot be read: No such file"):
-        load_experiment(tmp_path / "none.toml", _option_names())
+        load_experiment(tmp_path / "none.toml", option_names())
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_row_that_the_paper_does_not_have(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", EXPERIMENTS.values(), ids=lambda path: path.stem)
 def test_the_shipped_experiments(path: Path) -> None:
-    experiment = load_experiment(path, _option_names())
+    experiment = load_experiment(path, option_names())
     paper = check_table(experiment)
     assert experiment.name == path.stem
     assert f"lapgs bench {path.stem}" in path.read_text()

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import pytest
 
 from lapgs_bench.experiments import store as store_module
 from lapgs_bench.experiments.commands import defaults_of
-from lapgs_bench.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDING, RUNNING, ResultStore
+from lapgs_bench.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDING, RUNNING, Job, Outcome, ResultStore
 from lapgs_bench.experiments.worker import work
 from lapgs_plugin.errors import RunFolderError
 from tests.experiments.examples import COPY, START, copying_jobs, starts
@@ -28,6 +29,15 @@ WORKER += "print(work(Path(sys.argv[1]), sys.argv[2:]))"
 
 def start_worker(store: Path, run_ids: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", WORKER, str(store), *run_ids], stdout=subprocess.DEVNULL)
+
+
+def worked(folder: Path, jobs: Sequence[Job]) -> list[Outcome]:
+    """Plan the jobs, and work until all have ended."""
+    path, run_ids = folder / "results.sqlite", [job.run_id for job in jobs]
+    store = ResultStore.create(path)
+    store.plan(jobs)
+    assert work(path, run_ids) == len(jobs)
+    return store.outcomes(run_ids)
 
 
 @pytest.fixture
@@ -97,17 +107,6 @@ def test_a_worker_that_slept_through_its_lease_records_nothing(
     assert (outcome.state, outcome.record) == (DONE, {"psnr": 2.0})
 
 
-def test_a_lease_that_is_renewed_holds(planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    store, run_ids = planned
-    claim = store.claim(run_ids[:1])
-    assert claim is not None
-    now = time.time()
-    for later in (0.9, 1.8, 2.7):
-        monkeypatch.setattr(store_module.time, "time", lambda later=later: now + later * LEASE)
-        assert store.claim(run_ids[:1]) is None
-        assert store.renew(claim)
-
-
 def test_a_run_that_kills_its_workers_fails_in_the_end(
     planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,11 +143,7 @@ def test_what_is_done_stays_done_and_what_failed_gets_another_chance(
 def test_a_command_that_fails_is_reported_with_the_end_of_its_log(tmp_path: Path) -> None:
     lines = "".join(f"print('line {i}'); " for i in range(30)) + "sys.exit(3)"
     jobs = [*copying_jobs(tmp_path, 1, code=START + lines), *copying_jobs(tmp_path, 2)[1:]]
-    path, run_ids = tmp_path / "results.sqlite", [job.run_id for job in jobs]
-    store = ResultStore.create(path)
-    store.plan(jobs)
-    assert work(path, run_ids) == 2
-    failed, done = store.outcomes(run_ids)
+    failed, done = worked(tmp_path, jobs)
     assert (failed.state, done.state) == (FAILED, DONE), "the rest goes on"
     assert "exit code 3" in failed.error
     assert failed.error.splitlines()[-1] == "line 29"
@@ -157,10 +152,7 @@ def test_a_command_that_fails_is_reported_with_the_end_of_its_log(tmp_path: Path
 
 def test_a_command_that_writes_no_run_is_a_failure(tmp_path: Path) -> None:
     jobs = copying_jobs(tmp_path, 1, code=START)
-    store = ResultStore.create(tmp_path / "results.sqlite")
-    store.plan(jobs)
-    work(tmp_path / "results.sqlite", [jobs[0].run_id])
-    (outcome,) = store.outcomes()
+    (outcome,) = worked(tmp_path, jobs)
     assert outcome.state == FAILED
     assert "is not a run" in outcome.error
 
@@ -232,7 +224,7 @@ def test_many_processes_make_one_store(tmp_path: Path) -> None:
     code += "ResultStore.create(Path(sys.argv[1]))"
     makers = [subprocess.Popen([sys.executable, "-c", code, str(path)]) for _ in range(4)]
     assert [maker.wait(timeout=60) for maker in makers] == [0] * 4
-    assert sorted(each.name for each in path.parent.iterdir()) == ["results.sqlite"]
+    assert sorted(file.name for file in path.parent.iterdir()) == ["results.sqlite"]
 
 
 def test_a_transaction_that_is_killed_leaves_the_store_as_it_was(
@@ -267,10 +259,7 @@ def test_no_run_is_written_through_a_link(tmp_path: Path, name: str) -> None:
     path = Path(getattr(job, name))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.symlink_to(tmp_path / "precious" / ("" if name == "folder" else "file"))
-    store = ResultStore.create(tmp_path / "results.sqlite")
-    store.plan([job])
-    work(tmp_path / "results.sqlite", [job.run_id])
-    (outcome,) = store.outcomes([job.run_id])
+    (outcome,) = worked(tmp_path, [job])
     assert outcome.state == FAILED
     assert f"{path} is a link" in outcome.error
     assert (tmp_path / "precious" / "file").read_text() == "precious"

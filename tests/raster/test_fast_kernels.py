@@ -141,7 +141,7 @@ def splats_on_tiles(draw: st.DrawFn) -> tuple[NDArray[np.int32], NDArray[np.floa
 def test_tiles_list_their_splats_front_to_back(kind: type[np.floating[Any]], case: Any) -> None:
     boxes, depths, tiles_x, tiles_y = case
     depths = depths.astype(kind)
-    first_pair, places, tile_start, members = pipeline._order(
+    first_pair, places, tile_start, members = pipeline.list_tiles(
         len(boxes), boxes.reshape(-1), depths, tiles_x, tiles_x * tiles_y
     )
     order = np.argsort(depths, kind="stable")
@@ -160,7 +160,7 @@ def test_many_splats_are_sorted_in_all_digits() -> None:
     depths = np.exp(np.random.default_rng(1).uniform(-60, 60, 5000))
     boxes = np.tile(np.array([0, 0, 1, 1], np.int32), 5000)
     for kind in KINDS:
-        members = pipeline._order(5000, boxes, depths.astype(kind), 1, 1)[3]
+        members = pipeline.list_tiles(5000, boxes, depths.astype(kind), 1, 1)[3]
         np.testing.assert_array_equal(members, np.argsort(depths.astype(kind), kind="stable"))
 
 
