@@ -29,9 +29,9 @@ def assert_elements_close(actual: Tensor, expected: Tensor, bound: float, *, nam
     error = (actual.double() - expected.double()).abs() / expected.double().abs().max().clamp(min=1e-30)
     worst = float(error.max())
     if worst > bound:
-        place = tuple(int(i) for i in torch.unravel_index(error.argmax(), error.shape))
+        index = tuple(int(i) for i in torch.unravel_index(error.argmax(), error.shape))
         raise AssertionError(
-            f"{name}: element {place} is {actual[place]}, expected {expected[place]}: "
+            f"{name}: element {index} is {actual[index]}, expected {expected[index]}: "
             f"relative to the largest off by {worst:.2e} > {bound:.0e}"
         )
     return worst

@@ -18,12 +18,12 @@ def gradients(rasterizer: Rasterizer, case: Case, weights: Tensor) -> dict[str, 
     case = case.with_leaves()
     result = case.render(rasterizer)
     (result.image * weights).sum().backward()  # type: ignore[no-untyped-call]  # torch's
-    found = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
+    slopes = {name: value.grad for name, value in case.field.parameters.items()} | {"means2d": result.means2d.grad}
     if result.absgrad2d is not None:
-        found["absgrad2d"] = result.absgrad2d.clone()
-    missing = [name for name, value in found.items() if value is None]
+        slopes["absgrad2d"] = result.absgrad2d.clone()
+    missing = [name for name, value in slopes.items() if value is None]
     assert not missing, f"no gradient for {missing}"
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in slopes.items() if value is not None}
 
 
 def backgrounds() -> st.SearchStrategy[tuple[float, float, float]]:
@@ -63,9 +63,3 @@ def random_cases(draw: st.DrawFn, max_gaussians: int = 40, max_side: int = 40) -
         camera=camera,
     )
     return replace(case, sh_degree=draw(st.one_of(st.none(), st.integers(0, case.field.sh_degree))))
-
-
-def cases(max_gaussians: int = 40, max_side: int = 40) -> st.SearchStrategy[Case]:
-    """Draw random scenes, and sometimes an adversarial one."""
-    named = st.sampled_from(sorted(ADVERSARIAL)).map(lambda name: ADVERSARIAL[name]())
-    return st.one_of(random_cases(max_gaussians, max_side), random_cases(max_gaussians, max_side), named)
