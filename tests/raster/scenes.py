@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lapgs_plugin.evaluation.cases import *  # noqa: F403 - one place to import cases and strategies from
-from lapgs_plugin.evaluation.cases import ADVERSARIAL, BLACK, COLORED, WHITE, Case, make_camera, random_case
+from lapgs_plugin.evaluation.cases import BLACK, COLORED, WHITE, Case, make_camera, random_case
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import Rasterizer
 
