@@ -106,13 +106,10 @@ class GaussianField:
                 )
 
     def save_ply(self, path: Path | str, comments: Sequence[str] = ()) -> None:
-        """Write the field as a standard 3DGS PLY, little endian and float32.
+        """Write the field as a standard 3DGS PLY, little endian and float32, completely or not at all.
 
-        `load_ply` returns float32 parameters with the same bits. The file is written completely or not at all.
-
-        Args:
-            path: of the file.
-            comments: lines of the header; non-ASCII characters are written as question marks, line breaks as spaces.
+        `load_ply` returns float32 parameters with the same bits. Characters of `comments` that are not ASCII become
+        question marks, and line breaks spaces.
 
         Raises:
             OSError: the folder cannot be written, or the disk is full.

@@ -27,15 +27,7 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate the (degree + 1)^2 basis functions in the given directions.
-
-    Args:
-        directions: (n, 3) unit vectors.
-        degree: highest degree, 0 to 3.
-
-    Returns:
-        (n, (degree + 1)^2) values.
-    """
+    """Evaluate basis functions up to a degree from 0 to 3 at unit vectors (n, 3): (n, (degree + 1)^2)."""
     assert 0 <= degree <= MAX_SH_DEGREE, degree
     x, y, z = directions.unbind(-1)  # (n,) each
     values = [torch.full_like(x, SH_C0)]

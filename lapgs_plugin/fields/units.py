@@ -31,9 +31,7 @@ def in_unit(rasterizer: Rasterizer, unit: float) -> Rasterizer:
 class InUnit(Rasterizer):
     """Divide all lengths by a unit before rendering. Fields, cameras and gradients outside keep theirs.
 
-    Args:
-        rasterizer: renders.
-        unit: the length that is 1 for it, in world units; a power of two keeps positions exact.
+    The unit is in world units; a power of two keeps positions exact.
     """
 
     def __init__(self, rasterizer: Rasterizer, unit: float) -> None:
