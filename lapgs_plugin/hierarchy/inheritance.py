@@ -23,12 +23,7 @@ SINGLE_SIZE = math.sqrt(1e-7)
 
 
 class Inherited(NamedTuple):
-    """Hold a new field, and which Gaussians of the old field it came from.
-
-    Attributes:
-        field: the field to train.
-        kept: (m,) int64 rows of the old field, ascending; row i of the new field is row kept[i] of the old one.
-    """
+    """Hold the field to train, and the rows (m,) int64 of the old field that it came from, ascending."""
 
     field: GaussianField
     kept: Tensor  # (m,)
@@ -162,10 +157,7 @@ def _spacing(points: Tensor) -> Tensor:
 
 
 def places_of(points: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Find points that are at one place, to rounding.
-
-    Args:
-        points: (n, 3), n at least 1.
+    """Find points (n, 3) that are at one place, to rounding; n is at least 1.
 
     Returns:
         The row of a point at each of k places (k,), the place of each point (n,), and the size of a place in the
@@ -182,15 +174,9 @@ def places_of(points: Tensor) -> tuple[Tensor, Tensor, float]:
 
 
 def mean_squared_distance(points: Tensor) -> Tensor:
-    """Return the mean squared distance from each point to its three nearest neighbours.
+    """Return the mean squared distance (n,) from each point (n, 3) to its three nearest neighbours.
 
     With fewer than four points the mean is over all other points, and 0 for a single point.
-
-    Args:
-        points: (n, 3), n at least 1.
-
-    Returns:
-        (n,) in squared units of the points, with their type and device.
     """
     count = min(NEIGHBOURS, len(points) - 1)
     if count == 0:

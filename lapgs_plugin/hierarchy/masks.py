@@ -12,10 +12,8 @@ def masked_gaussian(pyramid: Pyramid, image: Tensor, mask: Tensor, levels: int) 
     """Build the Gaussian pyramid of a masked image: each level is Down(image x mask) / Down(mask).
 
     Args:
-        pyramid: the pair of Down and Up.
         image: (3, h, w).
         mask: (1, h, w) bool or in [0, 1]; pixels with 0 are ignored.
-        levels: number of levels, at least 1.
 
     Returns:
         Image and weight (1, h, w) of each level, finest first. The weight is the share of the pixel inside of the

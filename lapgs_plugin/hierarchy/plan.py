@@ -58,16 +58,12 @@ DEFAULT_HIERARCHY = Hierarchy.LAPLACIAN
 
 
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
-    """Return the size of a pyramid level: halved `level` times, odd sizes rounded up.
+    """Return the size of a pyramid level: that of level 0, halved `level` times, odd sizes rounded up.
 
     The sides are independent, so a size given height first is returned height first.
 
     >>> level_size((1063, 533), 1)
     (532, 267)
-
-    Args:
-        size: (width, height) in pixels of level 0.
-        level: at least 0.
 
     Raises:
         UserInputError: a negative level.

@@ -60,11 +60,7 @@ class Pyramid:
         return values.to(image.dtype)
 
     def up(self, image: Tensor, size: tuple[int, int]) -> Tensor:
-        """Upsample (..., ceil(h / 2), ceil(w / 2)) to (..., h, w).
-
-        Args:
-            image: the coarser image.
-            size: (h, w), height first.
+        """Upsample (..., ceil(h / 2), ceil(w / 2)) to (..., h, w) = `size`.
 
         Raises:
             UserInputError: the image is not half of `size`.
@@ -77,10 +73,7 @@ class Pyramid:
         return values.to(image.dtype)
 
     def up_taps(self, fine: int) -> tuple[Tensor, Tensor]:
-        """Return Up along one side as weighted sums: fine[i] = sum over k of weights[i, k] * coarse[first[i] + k].
-
-        Args:
-            fine: samples of the finer side.
+        """Return Up to a side of `fine` as weighted sums: fine[i] = sum over k of weights[i, k] * coarse[first[i] + k].
 
         Returns:
             first (fine,) int64 and weights (fine, k) float64, k at most 5, both on the CPU.
@@ -102,11 +95,7 @@ class Pyramid:
         return first, weights.scatter_add_(1, torch.where(used, parts - first[:, None], 0), shares)
 
     def gaussian(self, image: Tensor, levels: int) -> list[Tensor]:
-        """Build the Gaussian pyramid I^0 = `image`, I^(l+1) = Down(I^l), finest first.
-
-        Args:
-            image: (..., h, w).
-            levels: number of images to return, `image` included.
+        """Build the Gaussian pyramid I^0 = `image`, I^(l+1) = Down(I^l), finest first: `levels` images (..., h, w).
 
         Raises:
             UserInputError: fewer than one level.
@@ -120,10 +109,6 @@ class Pyramid:
 
     def laplacian(self, image: Tensor, levels: int) -> list[Tensor]:
         """Build the Laplacian pyramid R^l = I^l - Up(I^(l+1)) for l < levels - 1, then I^(levels-1); finest first.
-
-        Args:
-            image: (..., h, w).
-            levels: number of images to return: `levels` - 1 residuals and a coarse image.
 
         Raises:
             UserInputError: fewer than one level.
