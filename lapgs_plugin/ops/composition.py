@@ -104,8 +104,6 @@ def to_full_size(image: Tensor, size: tuple[int, int], level: int, pyramid: Pyra
     Args:
         image: (3, h, w) at the size of `level`.
         size: (width, height) of the full-resolution view.
-        level: level of the image.
-        pyramid: Up between two levels.
         finest: level at whose size to end instead.
     """
     for finer in range(level - 1, finest - 1, -1):

@@ -62,11 +62,7 @@ def _in_one_line(error: BaseException) -> str:
 
 
 def matches_reference(fallback: str, limit: float) -> Callable[[Difference], SelfCheck]:
-    """Make a `SelfCheck` of a function that returns the largest difference between kernels and PyTorch.
-
-    Args:
-        fallback, limit: as `SelfCheck` takes them.
-    """
+    """Make a `SelfCheck` of a function that returns the largest difference between kernels and PyTorch."""
     return lambda difference: SelfCheck(difference, fallback, limit)
 
 

@@ -74,12 +74,7 @@ class GpuFieldAdam(torch.optim.Optimizer):
 
 
 def step_together(optimizers: Sequence[GpuFieldAdam], scale: StepScale = ONE_VIEW) -> None:
-    """Step the five tensors of a field in one kernel.
-
-    Args:
-        optimizers: with their step sizes for a single view.
-        scale: how the step differs from one for a single view.
-    """
+    """Step the five tensors of a field in one kernel; step sizes are those for a single view, which `scale` changes."""
     from lapgs_plugin.ops.adam.in_triton import step_triton
 
     slots = [optimizer.next_step(scale) for optimizer in optimizers]

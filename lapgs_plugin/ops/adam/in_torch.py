@@ -34,11 +34,7 @@ class AdamSlot(NamedTuple):
 
 @torch.no_grad()
 def step_torch(slots: Sequence[AdamSlot], views: int = 1, gradient: float = 1.0) -> None:
-    """Step each tensor in place.
-
-    Args:
-        views, gradient: of a `StepScale`.
-    """
+    """Step each tensor in place; `views` and `gradient` are those of a `StepScale`."""
     for slot in slots:
         (keep1, keep2), scaled, count = (beta**views for beta in BETAS), gradient * slot.gradient, slot.step
         slot.mean.mul_(keep1).add_(scaled, alpha=1 - keep1)

@@ -21,17 +21,14 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
     """Return the loss of 3DGS, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable by the prediction.
 
-    On the CPU a fused kernel computes it together with its gradient. On a GPU two Triton kernels do, where they work;
-    else SSIM comes from the package `fused_ssim` or from kornia.
+    It is a scalar, the mean over several views. On the CPU a fused kernel computes it together with its gradient. On a
+    GPU two Triton kernels do, where they work; else SSIM comes from the package `fused_ssim` or from kornia.
 
     Args:
         prediction: (3, h, w), or (b, 3, h, w) of several views; colours in [0, 1], not clamped. Other numbers of
             channels take longer on a GPU.
         target: of that shape, without gradient; any float type, or uint8 levels k of k / 255.
         ssim_weight: lambda, in [0, 1].
-
-    Returns:
-        The loss, a scalar; the mean over several views.
 
     Raises:
         UserInputError: the images differ in shape, their channels come last, the target requires a gradient, the

@@ -22,11 +22,7 @@ SSIM_WINDOW = tuple(weight / math.fsum(_gauss) for weight in _gauss)
 
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the mean structural similarity as 3DGS computes it, a differentiable scalar, 1 for equal images.
-
-    Args:
-        prediction, target: (3, h, w), any float type; or (b, 3, h, w), whose mean is that of all images.
-    """
+    """Return the mean structural similarity of images (3, h, w) or (b, 3, h, w) as 3DGS computes it, differentiable."""
     return ssim_map(as_batch(prediction), as_batch(target)).mean()
 
 

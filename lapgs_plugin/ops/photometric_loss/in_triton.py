@@ -230,13 +230,7 @@ def _launch_of(
 
 
 def photometric_loss_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Do `photometric_loss` for images on a CUDA device, of any strides.
-
-    Args:
-        prediction: (3, h, w) or (b, 3, h, w), float32.
-        target: of that shape; float32, float16, or uint8 levels k of k / 255.
-        ssim_weight: lambda.
-    """
+    """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
     image = as_batch(prediction)
     if not (image.is_contiguous() or image.movedim(1, -1).is_contiguous()):
         image = image.contiguous()  # maps and gradient have the strides of the image

@@ -10,12 +10,7 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
 def add_noise(means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, amount: float) -> None:
-    """Move Gaussians by `displacements` of noise, which depends on the state of torch's generators, in place.
-
-    Args:
-        means: (n, 3).
-        quaternions, log_scales, opacity_logits, amount: as `displacements` takes them.
-    """
+    """Move means (n, 3) by `displacements` of noise, which depends on the state of torch's generators, in place."""
     if len(means) == 0:
         return
     if triton_works(means):

@@ -51,10 +51,6 @@ def _kernel(
 def add_noise_triton(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, amount: float, seed: int
 ) -> None:
-    """Do `add_noise` for contiguous float32 tensors on one CUDA device.
-
-    Args:
-        seed: from 0 to 2^31 - 1; the same one draws the same noise.
-    """
+    """Do `add_noise` for contiguous float32 tensors on one CUDA device; a seed from 0 to 2^31 - 1 fixes the noise."""
     n, parameters = len(means), (means, quaternions, log_scales, opacity_logits)
     launch(_kernel, (blocks(n, BLOCK),), *parameters, amount, seed, n, sharpness=SHARPNESS, faint=FAINT, block=BLOCK)

@@ -49,11 +49,7 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
 
 
 def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return Up(coarse), equal to `pyramid.up(coarse, size)` up to rounding, with its gradient.
-
-    Args:
-        coarse: as in `upsample_add`.
-        size: (h, w), height first.
+    """Return Up(coarse) of size (h, w), equal to `pyramid.up(coarse, size)` up to rounding, with its gradient.
 
     Raises:
         UserInputError: the image is not half of `size`.

@@ -41,11 +41,7 @@ _STRIP_ROWS = 32
 
 
 def across_weights(first: Integers, weights: Floats) -> Floats:
-    """Return the weights of the neighbours of each i, (2, NEIGHBOURS, pitch), for even and for odd fine samples.
-
-    Args:
-        first, weights: `Pyramid.up_taps` of the finer side.
-    """
+    """Return weights of the neighbours of each i, (2, NEIGHBOURS, pitch), for even and odd fine samples, from taps."""
     fine, taps = weights.shape
     pitch = -(-((fine + 1) // 2) // WIDTH) * WIDTH
     across = np.zeros((2, NEIGHBOURS, pitch), weights.dtype)
