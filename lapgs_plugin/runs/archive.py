@@ -62,7 +62,6 @@ class RunArchive(RunFiles):
 
         Args:
             path: the folder; created with its parents.
-            manifest: without records.
             overwrite: replace a run that is already there. Only files of a run are removed.
             since: nanoseconds as of `os.stat`; files written since then, by the calling program, may be there.
 
@@ -96,7 +95,6 @@ class RunArchive(RunFiles):
         """Open a run and check that the fields of its finished levels are complete.
 
         Args:
-            path: the folder.
             resume: lock it for writing.
             check: False checks a field only when `field` reads it, for callers that can use an incomplete run.
 

@@ -24,9 +24,7 @@ StopProfile = Callable[[], float]
 class GpuBusy:
     """Profile iterations in the middle of each fifth of a stage. Call `step` where `due`, outside of the clock.
 
-    Args:
-        iterations: of the stage; none are profiled for 0.
-        start: starts a profile.
+    None are profiled for 0 iterations.
     """
 
     def __init__(self, iterations: int = 0, start: Callable[[], StopProfile] | None = None) -> None:
@@ -77,11 +75,7 @@ def profile_kernels() -> StopProfile:
 
 
 def kernel_seconds(events: Iterable[Any]) -> float:
-    """Return the sum of the times of kernels, and of copies and fills within the device.
-
-    Args:
-        events: `torch.autograd.profiler_util.FunctionEvent`s.
-    """
+    """Return the time of kernels, and of copies and fills within the device, from events of PyTorch's profiler."""
     return 1e-6 * math.fsum(
         event.time_range.elapsed_us()
         for event in events

@@ -64,11 +64,7 @@ def chosen_precision(precision: str, device: torch.device | str) -> str:
 
 
 def eight_bit_levels(image: Tensor) -> Tensor | None:
-    """Return the uint8 levels k of an image whose values are all k/255; None for any other image.
-
-    Args:
-        image: float32, any shape, finite.
-    """
+    """Return the uint8 levels k of a finite float32 image whose values are all k/255; None for any other image."""
     levels = (image * 255).round_()
     low, high, distance = torch.stack([*levels.aminmax(), (levels / 255).sub_(image).abs_().amax()]).tolist()
     return levels.to(torch.uint8) if low >= 0 and high <= 255 and distance <= EIGHT_BIT_TOLERANCE else None
@@ -98,12 +94,7 @@ class _Image:
 
 @dataclass(frozen=True)
 class _Arrival:
-    """Hold stored bytes that were copied to the device.
-
-    Attributes:
-        stored: complete once `event` has happened.
-        event: in the store's stream; None if there is nothing to wait for.
-    """
+    """Hold stored bytes that were copied to the device, complete once `event` has happened; None needs no waiting."""
 
     stored: Tensor
     event: torch.cuda.Event | None
@@ -149,11 +140,7 @@ class ImageStore:
         self._255 = torch.tensor(255.0, device=self._device)
 
     def put(self, name: str, image: Tensor) -> None:
-        """Store an image, replacing an earlier one of that name.
-
-        Args:
-            name: of the view.
-            image: (3, h, w) or (1, h, w), any float type and device, not clamped. Copied.
+        """Store a copy of an image of a view, (3, h, w) or (1, h, w) of any float type; it replaces an earlier one.
 
         Raises:
             TrainingDivergedError: it holds NaN or inf, or values beyond float16 if that is the precision.
@@ -189,15 +176,10 @@ class ImageStore:
             self._coming.pop(next(iter(self._coming))).cancel()
 
     def get(self, *names: str) -> Tensor:
-        """Return an image on the device, float32, for the current stream. Do not modify it.
+        """Return images on the device, float32, for the current stream: (c, h, w) of one view, (b, c, h, w) of several.
 
-        The processor waits only for a file that is still being read.
-
-        Args:
-            names: of the view, or of several of one size, which are decoded together if they are encoded alike.
-
-        Returns:
-            (c, h, w) of one view, (b, c, h, w) of several.
+        Do not modify them. The processor waits only for a file that is still being read. Several views have one size;
+        they are decoded together if they are encoded alike.
 
         Raises:
             KeyError: there is no such image.

@@ -61,9 +61,6 @@ EXTENDED = "extended_{}.{}"
 def require_room(path: Path | str, overwrite: bool = False, since: int | None = None) -> None:
     """Check that `RunArchive.create` would accept the folder, before anything expensive is done. Writes nothing.
 
-    Args:
-        path, overwrite, since: as of `RunArchive.create`.
-
     Raises:
         RunFolderError: as `RunArchive.create`, except for problems that only writing shows.
     """
@@ -91,14 +88,10 @@ def require_room(path: Path | str, overwrite: bool = False, since: int | None = 
 
 
 def require_place(folder: Path, option: str = "--out") -> None:
-    """Refuse a folder that cannot be made or written, before the work whose result it is for. Leaves no file behind.
-
-    Args:
-        folder: for results.
-        option: that names it, for messages.
+    """Refuse a folder for results that cannot be made or written, before the work is done. Leaves no file behind.
 
     Raises:
-        UserInputError: it is a file or below one, it cannot be made, or it is not writable.
+        UserInputError: it is a file or below one, it cannot be made, or it is not writable; names the option.
     """
     existing = str(folder)
     # Not Path.exists, which raises where a name is too long for the file system.

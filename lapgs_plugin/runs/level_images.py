@@ -89,9 +89,7 @@ class LevelImages:
     """Store the images of one level: I^l, and Up(I^(l+1)) for supervisions that need it.
 
     Args:
-        stores: makes the stores.
         level: l.
-        pyramid: makes the images, on the stores' device.
         with_coarse: also store I^(l+1).
         masked: whether views have masks.
         exact: keep the images as float32, without encoding them, for training on a CPU.
@@ -130,7 +128,6 @@ class LevelImages:
         """Make and store the images of a view.
 
         Args:
-            name: of the view.
             image: (3, h, w) at full size.
             mask: (1, h, w), False where the image is ignored; None uses all of it.
             with_coarse: False for a view whose Up(I^(l+1)) is not needed.

@@ -271,11 +271,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, values: dict[str, Any], name: str = "the manifest") -> Manifest:
-        """Invert `dataclasses.asdict`, also after a round trip through JSON.
-
-        Args:
-            values: by field.
-            name: of their source, for messages.
+        """Invert `dataclasses.asdict`, also after a round trip through JSON; messages begin with `name`.
 
         Raises:
             RunFolderError: names a value that is missing, unknown, of another type or inconsistent.

@@ -19,28 +19,18 @@ LARGEST_ERROR = 0.5
 
 
 def predicted_exposures(learned: Exposures, views: Iterable[str]) -> dict[str, Tensor]:
-    """Predict the colour transforms of views.
+    """Predict colour transforms (3, 4) of views from those of the training photos, which keep their own.
 
-    Args:
-        learned: colour transforms of the training photos by name.
-        views: names of views; a training photo has its own transform.
-
-    Returns:
-        (3, 4) transforms by view; empty where neighbours predict no better than the identity.
+    Empty where neighbours predict no better than the identity.
     """
     names = sorted(learned)
     return _predicted(names, torch.tensor([learned[name] for name in names]), torch.eye(3, 4), views)
 
 
 def predicted_poses(learned: Poses, views: Iterable[str]) -> Poses:
-    """Predict the corrections of the poses of views.
+    """Predict pose corrections of views from those of the training photos, which keep their own.
 
-    Args:
-        learned: corrections of the training photos' poses by name.
-        views: names of views; a training photo has its own correction.
-
-    Returns:
-        Corrections by view; empty where neighbours predict no better than no correction.
+    Empty where neighbours predict no better than no correction.
     """
     if not learned:
         return {}
@@ -55,10 +45,8 @@ def _predicted(names: list[str], values: Tensor, neutral: Tensor, views: Iterabl
     """Return values by view: its own, or the mean of its neighbours'.
 
     Args:
-        names: of the training views, sorted.
-        values: (v, ...) theirs.
+        names: of the training views, sorted; `values` (v, ...) are theirs.
         neutral: value of a view that needs none.
-        views: names of views.
 
     Returns:
         Empty if other views are wanted and neighbours do not predict them.

@@ -45,10 +45,8 @@ class Overhead(dict[str, float]):
 class PeakMemory:
     """Measure the highest use of a GPU's memory since this was made, and how much of it were images.
 
-    Call `note` before images are added or removed, because the peak until then contained them.
-
-    Args:
-        device: its statistics are reset, here and by `note`; on a CPU nothing is measured.
+    Call `note` before images are added or removed, because the peak until then contained them. The device's statistics
+    are reset, here and by `note`; on a CPU nothing is measured.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -58,10 +56,7 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(device)
 
     def note(self, images: int) -> dict[str, int]:
-        """Read the peak since the last call.
-
-        Args:
-            images: bytes of images on the GPU during that time.
+        """Read the peak since the last call, during which `images` bytes of images were on the GPU.
 
         Returns:
             Bytes of the highest "peak" so far and of the "images" in it; empty on a CPU.

@@ -35,11 +35,7 @@ def write_tensors(path: Path, state: dict[str, Any]) -> None:
 
 
 def read_tensors(path: Path, advice: str) -> dict[str, Any]:
-    """Read a file of `write_tensors`, with tensors on the CPU.
-
-    Args:
-        path: of the file.
-        advice: next step of a user if it is damaged; ends the message.
+    """Read a file of `write_tensors`, with tensors on the CPU; messages end with advice.
 
     Raises:
         RunFolderError: it cannot be read, or its tensors would take more memory than the file has bytes.

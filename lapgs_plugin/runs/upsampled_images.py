@@ -17,24 +17,14 @@ from lapgs_plugin.runs.image_store import ImageStore
 
 
 class UpsampledImages:
-    """Return Up of stored images by name.
-
-    Attributes:
-        store: of the images before Up.
-        pyramid: Up between two levels.
-    """
+    """Return Up of images by name; `store` has the images before Up."""
 
     def __init__(self, store: ImageStore, pyramid: Pyramid) -> None:
         self.store, self.pyramid = store, pyramid
         self._sizes: dict[str, tuple[int, int]] = {}
 
     def put(self, name: str, image: Tensor, size: tuple[int, int]) -> None:
-        """Store an image, replacing an earlier one of that name.
-
-        Args:
-            name: of the view.
-            image: (c, ceil(h / 2), ceil(w / 2)), as `ImageStore.put` takes it.
-            size: (h, w) of the image that `get` returns, height first.
+        """Store a view's image (c, ceil(h / 2), ceil(w / 2)), replacing an earlier one; `get` returns it at (h, w).
 
         Raises:
             UserInputError: the image is not half of `size`; and all that `ImageStore.put` raises.
