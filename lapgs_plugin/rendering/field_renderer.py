@@ -36,12 +36,7 @@ class FieldOffload:
     _ready: dict[int, GaussianField] = field(default_factory=dict, repr=False)
 
     def bring(self, level: int, wanted: GaussianField) -> GaussianField:
-        """Return a level's field on `device`, for use in the current stream.
-
-        Args:
-            level: key of the kept copy.
-            wanted: the field, on any device.
-        """
+        """Return a level's field, which may be on any device, on `device`, for use in the current stream."""
         if wanted.means.device.type == self.device.type == "cpu":
             return wanted
         if level not in self._ready:

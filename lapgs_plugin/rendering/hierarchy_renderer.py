@@ -150,12 +150,7 @@ class HierarchyRenderer(FieldRenderer):
             raise UserInputError(f"level {level} cannot be rendered, expected {expected}; {why}")
 
     def level_for_size(self, camera: Camera, size: tuple[int, int]) -> int:
-        """Return the level of detail for an image size: the coarsest level that is not smaller, or else the finest.
-
-        Args:
-            camera: of the full-resolution view.
-            size: (width, height) in pixels at which the image is shown.
-        """
+        """Return the coarsest level of a full-size view that is not smaller than the shown size, or else the finest."""
         for level in range(self.levels - 1, self.finest, -1):
             width, height = level_size(camera.size, level)
             if width >= size[0] and height >= size[1]:
@@ -167,7 +162,6 @@ class HierarchyRenderer(FieldRenderer):
 
         Args:
             camera: of the full-resolution view.
-            level: finest level to add.
             gains: by level, the factor on its band, at least 0; 1 for levels that are not in it. A residual of gain 0
                 is not rendered.
 
@@ -199,8 +193,7 @@ class HierarchyRenderer(FieldRenderer):
     def images(self, cameras: Sequence[Camera], level: int = 0, gains: Mapping[int, float] | None = None) -> Tensor:
         """Return I_hat of `level`, (b, 3, h, w), without its bands: with nested levels one field is rendered.
 
-        Args, Raises:
-            As `render_batch`.
+        Arguments and errors are those of `render_batch`.
         """
         gains = self._checked(level, gains)
         needed = self.fields_for(level, gains) if self.nested else range(self.levels - 1, level - 1, -1)
@@ -208,11 +201,7 @@ class HierarchyRenderer(FieldRenderer):
 
     @torch.no_grad()
     def frames(self, cameras: Sequence[Camera], level: int = 0) -> Tensor:
-        """Return `images` clamped to [0, 1], (b, 3, h, w), to be shown or measured.
-
-        Args, Raises:
-            As `render_batch`.
-        """
+        """Return `images` clamped to [0, 1], to be shown or measured."""
         if self.nested or level == self.levels - 1:
             return self.images(cameras, level).clamp(0.0, 1.0)
         self.require_level(level)
@@ -223,10 +212,7 @@ class HierarchyRenderer(FieldRenderer):
     def band(self, camera: Camera, level: int, gain: float = 1.0) -> Tensor:
         """Return one level's part of the image, (3, h, w) at its size: a residual, or the coarsest level's image.
 
-        Args:
-            camera: of the full-resolution view.
-            level: whose band.
-            gain: factor on the band, at least 0; 0 gives zeros.
+        The factor on the band is at least 0; 0 gives zeros.
 
         Raises:
             UserInputError: as `render`.

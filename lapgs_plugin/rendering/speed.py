@@ -49,11 +49,8 @@ def measure_speed(
 ) -> list[Speed]:
     """Measure a hierarchy: composed down to `level`, to each coarser level, and each field alone.
 
-    Images are composed and clamped, and stay on the device. Each kind is run over all cameras once before it is timed.
-
-    Args:
-        cameras: of full-resolution views, at least one.
-        rounds: over all cameras.
+    Images are composed and clamped, and stay on the device. Each kind is run over all cameras once before it is timed
+    in so many rounds over them.
     """
     one_size = len({camera.size for camera in cameras}) == 1
     batches = renderer.device.type == "cuda" and one_size and len(cameras) >= BATCH
@@ -71,8 +68,6 @@ class _Kind:
     """Describe a kind of frame to measure.
 
     Attributes:
-        what: its name.
-        frame: renders `views` cameras.
         fields: levels whose fields are rendered.
         size_level: level whose size a frame has.
         views: of a frame.

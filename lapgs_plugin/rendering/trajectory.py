@@ -66,11 +66,7 @@ def spline(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     Positions follow a cubic spline, orientations a spline of constant angular acceleration between two cameras. The
     time between two cameras grows with their distance, so that the speed is nearly constant. Of many cameras every n-th
-    is passed.
-
-    Args:
-        cameras: at least one; the path has the size and lens of the median one.
-        frames: number of frames.
+    is passed. The path has the size and lens of the median camera.
     """
     from scipy.interpolate import CubicSpline  # a third of a second, which commands without such a path need not wait
     from scipy.spatial.transform import Rotation, RotationSpline
