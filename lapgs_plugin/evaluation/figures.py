@@ -73,15 +73,9 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Measure a complete run on its held-out views, or on its training views when none were held out.
 
-    All views are measured of a scene that the run was not trained on. Show a progress bar and write the result to the
-    run's metrics.json.
-
-    Args:
-        lpips: distances to measure, those of VGG by default. Distances without weights are left out, and
-            "lpips_missing" says so.
-
-    Returns:
-        The content of metrics.json.
+    All views are measured of a scene that the run was not trained on. Show a progress bar; write the result to the
+    run's metrics.json and return it. Without a request the LPIPS distances are those of VGG. Distances without weights
+    are left out, and "lpips_missing" says so.
 
     Raises:
         RunFolderError: the run is not complete, or its scene is missing.
@@ -135,11 +129,10 @@ def _measure_view(
 ) -> tuple[dict[str, Any], dict[int, dict[str, float]]]:
     """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device.
 
-    Args:
-        exposure: (3, 4) colour transform from renders to this photo; None without one.
+    The render first gets the photo's exposure, a (3, 4) colour transform, if there is one.
 
     Returns:
-        The view's entry of "views", and by level what it adds to "levels".
+        The view's entry of "views", and its figures for "levels" by level.
     """
     composed = composition.composed
     if exposure is not None:

@@ -230,7 +230,7 @@ class LpipsRequest:
 
     Attributes:
         variants: of `VARIANTS`; None for those of the files' networks, or of VGG without files.
-        files: files of weights; their shapes tell the network.
+        files: of weights, whose shapes tell the network.
     """
 
     variants: tuple[str, ...] | None = None
@@ -258,10 +258,7 @@ class LpipsRequest:
 
 
 def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.device) -> LpipsMetrics:
-    """Load the networks of a request whose weights can be found.
-
-    Args:
-        smallest_side: of the images, in pixels.
+    """Load the networks of a request whose weights are present, for images of at least `smallest_side` pixels.
 
     Raises:
         UserInputError: a named file cannot be read, or belongs to no known network.

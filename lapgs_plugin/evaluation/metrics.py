@@ -49,10 +49,7 @@ def color_fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None)
     """Return the PSNR in dB of the right half of an image, after a colour fit on its left half.
 
     The fit is the affine transform of RGB, A rgb + b, with the least squared error. It removes differences of exposure
-    and white balance that no other photo of a scene tells, as `fit_colors` explains.
-
-    Args:
-        image, target, mask: as `psnr` takes them, at least two pixels wide.
+    and white balance that no other photo of a scene tells. Arguments are those of `psnr`, two pixels wide or more.
     """
     middle = image.shape[-1] // 2
     left, right = slice(None, middle), slice(middle, None)
@@ -106,11 +103,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def mean_quality(pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
-    """Return the means of "psnr" (in dB) and "ssim" over images; empty without an image.
-
-    Args:
-        pairs: image, target and perhaps a mask, as `psnr` and `ssim` take them.
-    """
+    """Return the means of "psnr" (dB) and "ssim" over pairs of images, with masks or without; empty without images."""
     return means([{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs])
 
 

@@ -77,12 +77,7 @@ class Frame:
 
 @dataclass
 class Flicker:
-    """Add up differences between frames and their predecessors, over all pixels that both show.
-
-    Attributes:
-        absolute, squared: sums over pixels and channels.
-        values: number of values summed.
-    """
+    """Add up differences between frames and their predecessors, over all pixels, channels and frames that both show."""
 
     absolute: float = 0.0
     squared: float = 0.0
