@@ -141,13 +141,7 @@ class OracleRasterizer(Rasterizer):
 
 
 def project(field: GaussianField, camera: Camera, *, three_sigma_cut: bool = True) -> Projection:
-    """Project the Gaussians that reach the image (EWA).
-
-    Args:
-        field: n Gaussians.
-        camera: with its pose on the field's device and in its precision.
-        three_sigma_cut: as in `OracleRasterizer`.
-    """
+    """Project the Gaussians that reach the image (EWA); the camera has the field's device and precision."""
     # Culled without gradients first: in the graph, the zero gradient of a Gaussian times the infinite derivative by a
     # depth or determinant of zero would be NaN.
     with torch.no_grad():
@@ -196,15 +190,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def world_covariances(quaternions: Tensor, log_scales: Tensor) -> Tensor:
-    """Compute Sigma = R S S^T R^T.
-
-    Args:
-        quaternions: (n, 4) wxyz, of any length.
-        log_scales: (n, 3) logarithms of the standard deviations.
-
-    Returns:
-        (n, 3, 3) covariances in world coordinates.
-    """
+    """Compute Sigma = R S S^T R^T in world coordinates, (n, 3, 3), from quaternions (n, 4) and log scales (n, 3)."""
     rotations = rotation_matrices(torch.nn.functional.normalize(quaternions, dim=-1))  # (n, 3, 3)
     axes = rotations * torch.exp(log_scales)[:, None, :]  # (n, 3, 3) R S
     return axes @ axes.mT
@@ -243,14 +229,10 @@ def inverse_covariances(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor
 
 
 def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
-    """Return ceil(3 sqrt(lambda_max)) with the larger eigenvalue of the 2D covariance.
+    """Return ceil(3 sqrt(lambda_max)) in whole pixels, (n,), with the larger eigenvalue of the 2D covariance.
 
     Args:
-        xx, yy: (n,) diagonal of the covariance in px^2.
-        determinant: (n,) of the covariance in px^4.
-
-    Returns:
-        (n,) whole pixels.
+        xx, yy, determinant: (n,) diagonal in px^2, and determinant in px^4, of the covariance.
     """
     middle = (xx + yy) / 2  # (n,)
     largest = middle + (middle * middle - determinant).clamp(min=MIN_ROOT).sqrt()  # (n,)
@@ -278,12 +260,7 @@ def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
 
 
 def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
-    """List every (tile, Gaussian) pair, sorted by tile, then depth, then index.
-
-    Args:
-        depths: (v,) camera-space z.
-        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` returns them.
-    """
+    """List every (tile, Gaussian) pair by tile, then depth (v,), then index, from `tile_rectangles` (v, 4)."""
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     order = torch.sort(depths.detach(), stable=True).indices  # (v,) front to back
     x0, y0, x1, y1 = rectangles[order].unbind(-1)  # (v,) each

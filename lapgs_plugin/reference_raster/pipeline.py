@@ -24,12 +24,7 @@ from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, SLOT, SPLAT, TI
 
 @dataclass(frozen=True)
 class View:
-    """Hold an image size and a camera.
-
-    Attributes:
-        width, height: in pixels.
-        camera: (CAMERA,), see `layout.CAMERA`.
-    """
+    """Hold an image size in pixels and a camera (CAMERA,), see `layout.CAMERA`."""
 
     width: int
     height: int
@@ -75,14 +70,9 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Rendering:
-    """Hold an image, and the inputs of its backward pass.
+    """Hold image (3, height, width), transmittance (height, width), radii (n,) int32 and centres (n, 2).
 
-    Attributes:
-        image: (3, height, width).
-        transmittance: (height, width).
-        radii: (n,) int32.
-        centres: (n, 2).
-        kept: None unless it was asked for.
+    The inputs of its backward pass are `kept` if they were asked for.
     """
 
     image: Floats
@@ -187,9 +177,7 @@ def gradients(
 ) -> Gradients:
     """Differentiate a loss of the image that `render` made of the same Gaussians with `keep`.
 
-    Args:
-        grad_image: (3, height, width) derivative of the loss by the image.
-        grad_transmittance: (height, width) derivative by the transmittance, or None for zero.
+    Its derivatives are (3, height, width) by the image, and (height, width) by the transmittance or None for zero.
     """
     kept = rendering.kept
     assert kept is not None, "rendered without keep=True"
@@ -229,12 +217,7 @@ def gradients(
 def make_view(
     width: int, height: int, world_to_camera: Floats, focal: tuple[float, float], principal: tuple[float, float]
 ) -> View:
-    """Make a view from a camera as `fields.camera.Camera` describes one.
-
-    Args:
-        world_to_camera: (4, 4), in the Gaussians' float type.
-        focal, principal: in pixels, x and y.
-    """
+    """Make a view from a camera as `fields.camera.Camera` describes one; its pose is in the Gaussians' float type."""
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     limits = JACOBIAN_LIMIT * width / (2 * focal[0]), JACOBIAN_LIMIT * height / (2 * focal[1])
     values = [*rotation.ravel(), *translation, *(-rotation.T @ translation), *focal, *principal, *limits]

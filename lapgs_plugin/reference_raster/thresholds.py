@@ -115,7 +115,6 @@ def threshold_mask(
 
     Args:
         field: n Gaussians, the same bits as rendered.
-        camera: the view.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
         three_sigma_cut: as in `OracleRasterizer`.
@@ -196,11 +195,7 @@ class _Shapes:
 def _shapes(
     field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float
 ) -> _Shapes:
-    """Compute the footprints of the Gaussians `ids` at camera-space `points` (v, 3).
-
-    Args:
-        relative: (v,) relative error of the Jacobians.
-    """
+    """Compute footprints of Gaussians `ids` at camera-space points (v, 3), with relative errors (v,) of Jacobians."""
     jacobians = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov)  # (v, 2, 3)
     to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
     covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
