@@ -42,12 +42,7 @@ class Step:
 
 
 class Locations:
-    """Find folders of scenes, data sets and checkouts.
-
-    Args:
-        folders: by name, from --path.
-        base: of relative paths in the experiment file.
-    """
+    """Find folders of scenes, data sets and checkouts: by name from --path, or relative to the experiment file."""
 
     def __init__(self, folders: Mapping[str, Path], base: Path) -> None:
         self._folders, self._base = folders, base

@@ -24,12 +24,7 @@ from lapgs_plugin.errors import UserInputError, require_extra, typed_line
 
 @dataclass(frozen=True)
 class WorkOrder:
-    """Describe the work of workers.
-
-    Attributes:
-        store: of results, on a disk that all workers see.
-        logs: folder for the workers' own output.
-    """
+    """Describe the work of workers: runs of a store on a disk that all see, and a folder for their own output."""
 
     store: Path
     run_ids: Sequence[str]

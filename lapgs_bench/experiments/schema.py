@@ -246,11 +246,7 @@ ALTERNATIVES = ("bool", "int", "float", "str", "dict[str,str]")
 
 
 def load_experiment(path: Path, option_names: Mapping[str, Set[str]]) -> Experiment:
-    """Read and check an experiment file.
-
-    Args:
-        path: a TOML file.
-        option_names: by command, "train" and "run", the options that an experiment may set.
+    """Read and check an experiment file in TOML, given the options by command that an experiment may set.
 
     Raises:
         UserInputError: it cannot be read, is not TOML, or has mistakes: one line for each, which names the key, and for

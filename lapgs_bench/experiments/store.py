@@ -126,15 +126,11 @@ class Outcome:
 
 
 class ResultStore:
-    """Keep an experiment's results. Each method is one transaction; threads may share an object.
-
-    All methods raise RunFolderError when the file cannot be read or written.
-
-    Args:
-        path: the file; `create` makes a new one.
+    """Keep an experiment's results in a file. Each method is one transaction; threads may share an object.
 
     Raises:
-        RunFolderError: the file is missing, is no store, or was written by another version.
+        RunFolderError: the file is missing, is no store, or was written by another version; from all methods, it cannot
+            be read or written.
     """
 
     def __init__(self, path: Path) -> None:

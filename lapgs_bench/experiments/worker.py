@@ -29,12 +29,7 @@ LAST_LINES = 12
 
 @dataclass(frozen=True)
 class Slot:
-    """Reserve a part of a machine for a worker.
-
-    Attributes:
-        gpu: value of CUDA_VISIBLE_DEVICES; None leaves it unchanged.
-        cores: numbers of processors; empty means all.
-    """
+    """Reserve a part of a machine for a worker: a value of CUDA_VISIBLE_DEVICES, or None; processors, all if empty."""
 
     gpu: str | None = None
     cores: tuple[int, ...] = ()

@@ -69,13 +69,7 @@ class OpTime:
 
 
 def benchmark(device: torch.device, width: int, height: int, gaussians: int, repeats: int) -> list[OpTime]:
-    """Time all operations; the versions of one take turns, so that a change in the machine's load meets all of them.
-
-    Args:
-        width, height: of the images, in pixels.
-        gaussians: in the field.
-        repeats: turns.
-    """
+    """Time all operations; the versions of one take turns, so that a change in the machine's load meets all of them."""
     ours = "Triton" if device.type == "cuda" else NUMBA
     generator = torch.Generator().manual_seed(0)
     images = [torch.rand(3, height, width, generator=generator).to(device) for _ in range(2)]

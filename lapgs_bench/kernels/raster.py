@@ -268,11 +268,9 @@ def planned_turns(case: BenchCase, turns: int, contenders: Sequence[str]) -> lis
 def run_case(
     case: BenchCase, turns: int, dtype: torch.dtype, advance: Callable[[str], None] = lambda name: None
 ) -> CaseResult:
-    """Measure one case.
+    """Measure one case in turns of `FAST_ITERATIONS` timed iterations; slow contenders get fewer turns in large cases.
 
-    Args:
-        turns: of the fast contender, each with `FAST_ITERATIONS` timed iterations; slow ones get fewer in large cases.
-        advance: called after each turn with the contender's name.
+    `advance` is called after each turn with the contender's name.
     """
     scene = make_scene(case.width, case.height, case.gaussians, dtype)
     contenders = make_contenders(scene)
