@@ -39,6 +39,8 @@ COUNTS = {
 }
 """Columns with numbers of Gaussians; the first that all rows have is drawn."""
 
+PARTS_MS = {f"{part}_ms": part for part in PARTS}
+"""Columns with the milliseconds of parts of an iteration."""
 FIGURES = ("train_seconds", "gaussians")
 """Columns with numbers that every row has."""
 
@@ -111,6 +113,11 @@ class ExperimentReport(FolderReport):
     def write(self, folder: Path, options: RenderOptions) -> Path:
         results = Results.read(folder)
         title, tables = _tables(folder / MARKDOWN)
+        overheads = {
+            column: column.removeprefix("overhead_").removesuffix("_seconds")
+            for column in columns_of(results.rows)
+            if column.startswith("overhead_") and column != "overhead_seconds"
+        }
         page = render_page(
             TEMPLATE,
             title=title or str(results.rows[0].get("experiment", folder.name)),
@@ -118,8 +125,8 @@ class ExperimentReport(FolderReport):
             variants={name: results.style(name) for name in results.variants},
             num_runs=len({row["run"] for row in results.rows}),
             arrows=_time_arrows(results),
-            breakdown=_breakdown(results),
-            overhead=_overhead(results),
+            breakdown=_bars(results, "An iteration", PARTS_MS, lambda value: f"{number_text(value)} ms"),
+            overhead=_bars(results, "Overhead", overheads, seconds_text),
             parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
             machines=_machines(results),
         )
@@ -175,24 +182,8 @@ def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
     return fmean(row[column] for row in rows), fmean(row["train_seconds"] for row in rows)
 
 
-def _breakdown(results: Results) -> BarChart | None:
-    """Draw milliseconds an iteration by part, means over scenes and seeds."""
-    names = {f"{part}_ms": part for part in PARTS}
-    return _bars(results, "An iteration", names, lambda value: f"{number_text(value)} ms")
-
-
-def _overhead(results: Results) -> BarChart | None:
-    """Draw seconds of overhead, means over scenes and seeds."""
-    names = {
-        column: column.removeprefix("overhead_").removesuffix("_seconds")
-        for column in columns_of(results.rows)
-        if column.startswith("overhead_") and column != "overhead_seconds"
-    }
-    return _bars(results, "Overhead", names, seconds_text)
-
-
 def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable[[float], str]) -> BarChart | None:
-    """Draw a bar for each variant on each backbone that has any of these columns."""
+    """Draw a bar for each variant on each backbone that has any of these columns, of means over scenes and seeds."""
     bars = []
     for backbone in dict.fromkeys(row["backbone"] for row in results.rows):
         for variant in results.variants:

@@ -77,7 +77,9 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
     check_runs(planned, jobs, scene_folders, mistakes, here=here)
     mistakes.refuse()
     if settings.dry_run:
-        _print_commands(jobs)
+        for job in jobs:
+            commands = [f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}" for step in job.steps]
+            say("\n".join([f"# {job.run_id}", *commands]))
         return
     make_samples(scenes, folder)
     _follow(jobs, folder, settings.engine)
@@ -101,13 +103,6 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
         if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
     return [word for file in weights for word in ("--lpips-weights", str(file.absolute()))]
-
-
-def _print_commands(jobs: Sequence[Job]) -> None:
-    for job in jobs:
-        say(f"# {job.run_id}")
-        for step in job.steps:
-            say(f"cd {shlex.quote(step.cwd)} && {shlex.join(step.command)}")
 
 
 def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:

@@ -201,7 +201,7 @@ class ResultStore:
                         (FAILED, f"the worker that ran it died {claims} times", run_id),
                     )
                     continue
-                owner = _new_owner()
+                owner = f"{socket.gethostname()}|{os.getpid()}|{uuid.uuid4().hex}"
                 connection.execute(
                     "UPDATE runs SET state = ?, owner = ?, lease_until = ?, claims = ? WHERE run_id = ?",
                     (RUNNING, owner, time.time() + LEASE, claims + 1, run_id),
@@ -296,10 +296,6 @@ def _differences(one: str, other: str) -> str:
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     words = [f"{name} was {shortened(before.get(name))}, is {shortened(now.get(name))}" for name in names]
     return "; ".join(words[:SHOWN])
-
-
-def _new_owner() -> str:
-    return f"{socket.gethostname()}|{os.getpid()}|{uuid.uuid4().hex}"
 
 
 def _abandoned(owner: str, lease_until: float, now: float) -> bool:

@@ -149,12 +149,11 @@ def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | N
         losses["fused_ssim"] = in_parts(partial(photometric_loss_torch, mean_ssim=fused))
     if ours == NUMBA or photometric_loss.triton_works():
         losses[ours] = whole
-    return {name: Version(partial(_gradient, loss, leaf)) for name, loss in losses.items()}
 
+    def gradient(loss: Callable[[], Tensor]) -> Tensor:
+        return torch.autograd.grad(loss(), leaf)[0] * leaf.numel()  # times so many, so that values are about 1
 
-def _gradient(loss: Callable[[], Tensor], leaf: Tensor) -> Tensor:
-    """Return the gradient, times the number of pixels and channels, so that values are about 1."""
-    return torch.autograd.grad(loss(), leaf)[0] * leaf.numel()
+    return {name: Version(partial(gradient, loss)) for name, loss in losses.items()}
 
 
 def _transform_versions(image: Tensor) -> Versions:

@@ -336,19 +336,15 @@ def peak_memory(case: BenchCase, dtype: torch.dtype) -> int | None:
     return int(answer) if answer else None
 
 
-def _own_peak_memory() -> int | None:
-    status = Path("/proc/self/status")  # getrusage counts the parent's memory, too
-    match = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
-    return None if match is None else int(match[1]) * 1024
-
-
 def _main(name: str, dtype: str) -> None:
+    """Train a few iterations, and print the peak memory of this process in bytes, if the system reports it."""
     (case,) = parse_cases(name)
     contender = _fast(make_scene(case.width, case.height, case.gaussians, getattr(torch, dtype)))
     for _ in range(3):
         contender.iteration()
-    peak = _own_peak_memory()
-    print("" if peak is None else peak)
+    status = Path("/proc/self/status")  # getrusage counts the parent's memory, too
+    match = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
+    print("" if match is None else int(match[1]) * 1024)
 
 
 if __name__ == "__main__":

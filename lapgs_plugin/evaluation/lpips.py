@@ -274,7 +274,8 @@ def lpips_metrics(request: LpipsRequest, smallest_side: int, device: torch.devic
         name = network_of(variant)
         if name in networks:
             continue
-        weights = named.get(name) or _cached(name)
+        cached = _cache_path(name)
+        weights = named.get(name) or (_read(cached) if cached.is_file() else None)
         if weights is None:
             missing[variant] = f"no weights; {_how_to_get(name)}"
         elif smallest_side < NETWORKS[name].smallest:
@@ -339,12 +340,6 @@ def _how_to_get(name: str) -> str:
         f"get them with: curl -fL --create-dirs -o {target} {DOWNLOADS}{NETWORKS[name].cached_as} (or copy that file "
         "from another machine and name it with --lpips-weights)"
     )
-
-
-def _cached(name: str) -> Mapping[str, Tensor] | None:
-    """Read the weights that torchvision downloaded earlier; None where there are none."""
-    path = _cache_path(name)
-    return _read(path) if path.is_file() else None
 
 
 def _with_learned(name: str, weights: Mapping[str, Tensor]) -> Mapping[str, Tensor] | None:

@@ -80,13 +80,9 @@ def file_stems(views: Sequence[View]) -> dict[str, str]:
 
     Folders in a name are kept, except steps upwards, so that no file is written outside the output folder.
     """
-    paths = {view.name: _inside(view.name) for view in views}
+    names = [view.name for view in views]
+    paths = {name: PurePosixPath(*(p for p in PurePosixPath(name).parts if p not in ("/", ".."))) for name in names}
     users = Counter(path.with_suffix("") for path in paths.values())
     return {
         name: str(path.with_suffix("") if users[path.with_suffix("")] == 1 else path) for name, path in paths.items()
     }
-
-
-def _inside(name: str) -> PurePosixPath:
-    """Return a name as a relative path without steps upwards."""
-    return PurePosixPath(*(part for part in PurePosixPath(name).parts if part not in ("/", "..")))

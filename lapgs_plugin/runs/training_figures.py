@@ -63,23 +63,20 @@ def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:
     memory = [record.memory_bytes for record in records if record.memory_bytes]
     busy = [record.gpu_busy_seconds for record in records if record.gpu_busy_seconds is not None]
     whole = all(record.breakdown_seconds for record in records)
+    # The last field that renders a whole image, and the residuals that are added to it.
+    rendered = records[max((index for index, record in enumerate(records) if not record.signed), default=0) :]
     return {
         "train_seconds": math.fsum(record.train_seconds for record in records),
         "overhead_seconds": sums(record.overhead_seconds for record in records),
         "breakdown_seconds": sums(record.breakdown_seconds for record in records) if whole else {},
         "gpu_busy_seconds": math.fsum(busy) if len(busy) == len(records) else None,
-        "num_gaussians": {str(record.level): record.num_gaussians for record in _rendered(records)},
+        "num_gaussians": {str(record.level): record.num_gaussians for record in rendered},
         "weighted_gaussians": _weighted([record.num_gaussians for record in records], iterations),
         "mean_gaussians": _weighted(means, iterations) if len(means) == len(records) else None,
         "peak_gaussians": max(record.peak_gaussians for record in records),
         "peak_memory_bytes": max((usage["peak"] for usage in memory), default=None),
         "peak_memory_without_images_bytes": max((usage["peak"] - usage["images"] for usage in memory), default=None),
     }
-
-
-def _rendered(records: Sequence[LevelRecord]) -> Sequence[LevelRecord]:
-    """Select the last field that renders a whole image, and the residuals that are added to it."""
-    return records[max((index for index, record in enumerate(records) if not record.signed), default=0) :]
 
 
 def sums(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
