@@ -60,7 +60,7 @@ RESIDUAL = ("is about residuals", "add --hierarchy laplacian")
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a scene of 48x32 pixels."""
     folder = tmp_path_factory.mktemp("experiments")
     make_sample_scene(folder / "scene", width=48, height=32, views=10, points=100, progress=False)
@@ -70,8 +70,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _here(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(place)
+def _here(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(scenes)
     for name in ("MINE", "FASTGS"):
         monkeypatch.delenv(f"LAPGS_{name}", raising=False)
 
@@ -264,29 +264,29 @@ def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.Monkey
     assert commands_of(text).count("\n# ") + 1 == 10, "two seeds of five runs"
 
 
-def test_shipped_experiments_have_nothing_that_is_refused(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_experiments_have_nothing_that_is_refused(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check each with one scene instead of its data sets, large enough for its levels."""
-    scene = place / "scene"
+    scene = scenes / "scene"
     camera = Camera(1600, 1066, 1600.0, 1600.0, 800.0, 533.0, torch.eye(4))
     monkeypatch.setattr("lapgs_plugin.scenes.scene.load_cameras", lambda *_, **__: ({"0.jpg": camera}, {}))
     for shipped, path in EXPERIMENTS.items():
         experiment = load_experiment(path, option_names())
         names = {name for entry in experiment.scenes for name in entry.names}
         for name in names:
-            link = place / "links" / name
+            link = scenes / "links" / name
             link.parent.mkdir(exist_ok=True)
             if not link.exists():
                 link.symlink_to(scene)
-        paths = [f"{name}={place / 'links' / name}" for name in names]
+        paths = [f"{name}={scenes / 'links' / name}" for name in names]
         paths += [f"{name}={CHECKOUTS / name}" for name in ("fastgs", "taming", "graphdeco")]
         words = ["bench", shipped, "--dry-run", "--no-eval", *(word for p in paths for word in ("--path", p))]
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, (shipped, str(result.exception))
 
 
-def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(place: Path) -> None:
+def test_runs_of_the_built_in_trainer_that_cannot_read_their_scene_are_refused(scenes: Path) -> None:
     """Scripts have their own way to read scenes."""
-    model = place / "scene" / "sparse" / "0" / "points3D.bin"
+    model = scenes / "scene" / "sparse" / "0" / "points3D.bin"
     whole = model.read_bytes()
     model.write_bytes(whole[:50])
     try:

@@ -98,8 +98,8 @@ def regularized() -> Pair:
     logits.grad = torch.tensor([0.0, 1.0])
     add_regularization(logits, log_scales, 0.3, 0.25)
     assert log_scales.grad is not None
-    found = torch.cat([logits.grad, log_scales.grad.flatten()])
-    return found, torch.tensor([0.3 / 8, 1 + 0.3 / 8, *[0.25 / 6] * 6])
+    result = torch.cat([logits.grad, log_scales.grad.flatten()])
+    return result, torch.tensor([0.3 / 8, 1 + 0.3 / 8, *[0.25 / 6] * 6])
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_an_operation(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setitem(sys.modules, f"lapgs_plugin.ops.{operation}.in_triton", broken(*kernels))
-    found, expected = compute()
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)  # float32 of about 1; worst seen 2e-7
+    result, expected = compute()
+    torch.testing.assert_close(result, expected, rtol=0, atol=1e-5)  # float32 of about 1; worst seen 2e-7
     (line,) = said(caplog)
     assert line.startswith(instead)
     assert line.endswith(": module 'triton.language' has no attribute 'join'")
@@ -152,8 +152,8 @@ def test_a_kernel_of_rendering(name: str, caplog: pytest.LogCaptureFixture) -> N
         with direct_on_cpu(**{name: raises}):
             rasterizer = GsplatRasterizer(device="cpu")
             rasterizer._may_be_direct = True
-            found = rasterizer.render_image(field(), camera, background=black)
+            result = rasterizer.render_image(field(), camera, background=black)
             assert not rasterizer._calls_kernels(field())
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(result, expected, rtol=0, atol=1e-6)
     line = said(caplog)[0]
     assert line.startswith("rendering by `gsplat.rasterization`, which takes longer: module 'triton.language' has")

@@ -24,13 +24,13 @@ def test_pixels_are_what_an_image_of_one_white_gaussian_adds_up_to() -> None:
         white = torch.zeros(40, 1, 3)
         white[index] = 1 / SH_C0
         alone = replace(field, sh=white, signed=True).to(dtype=torch.float64)
-        sums = [oracle(alone, each.to(dtype=torch.float64), background=black).image[0].sum() for each in cameras]
+        sums = [oracle(alone, camera.to(dtype=torch.float64), background=black).image[0].sum() for camera in cameras]
         expected.append(max(float(value) for value in sums))
     grey = torch.zeros(40, 1, 3, requires_grad=True)
     plain, rasterizer = replace(field, sh=grey), CpuRasterizer()
-    found = blended_pixels((rasterizer(plain, each, background=torch.ones(3)).image for each in cameras), grey)
+    pixels = blended_pixels((rasterizer(plain, seen, background=torch.ones(3)).image for seen in cameras), grey)
     # Sums of 2 to 51 pixels, worst seen 5.6e-7; 5.4e-6 where all that is rendered was moved by a rounding.
-    torch.testing.assert_close(found.double(), torch.tensor(expected, dtype=torch.float64), rtol=2e-5, atol=0)
+    torch.testing.assert_close(pixels.double(), torch.tensor(expected, dtype=torch.float64), rtol=2e-5, atol=0)
 
 
 @given(

@@ -80,9 +80,7 @@ def test_a_plane_that_stands_still_does_not_flicker() -> None:
 def test_a_wrong_depth_shows_as_flicker() -> None:
     """Following the same images with a depth that ignores the slope gives the flicker of a wrong correspondence."""
     frames = [frame(number) for number in range(6)]
-    flat = [
-        replace(each, depth=DepthImage(torch.full_like(each.depth.depth, 4.0), each.depth.cover)) for each in frames
-    ]
+    flat = [replace(one, depth=DepthImage(torch.full_like(one.depth.depth, 4.0), one.depth.cover)) for one in frames]
     assert measure_flicker(flat)[0]["image"].mean > 20 * measure_flicker(frames)[0]["image"].mean
 
 

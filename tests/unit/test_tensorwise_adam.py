@@ -23,72 +23,72 @@ def works(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
 
 
-def made(device: str, **options: Any) -> tuple[list[torch.nn.Parameter], torch.optim.Adam]:
+def new_adam(device: str, **options: Any) -> tuple[list[torch.nn.Parameter], torch.optim.Adam]:
     """Return parameters as a 3DGS model has them, and its optimizer."""
     generator = torch.Generator().manual_seed(0)
     shapes = (700, 3), (700, 1, 3), (700, 15, 3), (700, 1), (0, 3)
     tensors = [torch.randn(shape, generator=generator).to(device) for shape in shapes]
     tensors.append(torch.randn(3, 700, generator=generator).to(device).T)  # not contiguous
     parameters = [torch.nn.Parameter(tensor) for tensor in tensors]
-    groups = [{"params": [one], "lr": 0.1 * (place + 1), "name": str(place)} for place, one in enumerate(parameters)]
+    groups = [{"params": [one], "lr": 0.1 * (index + 1), "name": str(index)} for index, one in enumerate(parameters)]
     return parameters, torch.optim.Adam(groups, lr=0.0, eps=1e-15, **options)
 
 
 def step(parameters: list[torch.nn.Parameter], optimizer: torch.optim.Optimizer, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    for place, one in enumerate(parameters):
+    for index, one in enumerate(parameters):
         gradient = torch.randn(one.shape, generator=generator).to(one.device)
         # Of the parameter's strides, as autograd makes it.
-        one.grad = None if (place, seed) == (1, 1) else torch.empty_like(one).copy_(gradient)
+        one.grad = None if (index, seed) == (1, 1) else torch.empty_like(one).copy_(gradient)
     optimizer.param_groups[0]["lr"] = np.float64(0.1 / (1 + seed))  # as 3DGS's schedule of positions
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)
 
 
-def assert_same(found: list[torch.nn.Parameter], expected: list[torch.nn.Parameter]) -> None:
-    for one, other in zip(found, expected, strict=True):
+def assert_same(stepped: list[torch.nn.Parameter], expected: list[torch.nn.Parameter]) -> None:
+    for one, other in zip(stepped, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-5)  # numbers to 5, moved by 1; worst seen 5e-7
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("betas", [(0.9, 0.999), (0.5, 0.9)])
 def test_steps_are_those_of_pytorch(device: str, betas: tuple[float, float], works: None) -> None:
-    (found, ours), (expected, theirs) = made(device, betas=betas), made(device, betas=betas)
-    step(found, ours, 0), step(expected, theirs, 0)  # so that there is state to take over
+    (stepped, ours), (expected, theirs) = new_adam(device, betas=betas), new_adam(device, betas=betas)
+    step(stepped, ours, 0), step(expected, theirs, 0)  # so that there is state to take over
     fuse_steps(ours)
     assert type(ours) is TensorwiseAdam
     for seed in range(1, 5):
-        step(found, ours, seed)
+        step(stepped, ours, seed)
         step(expected, theirs, seed)
-    assert_same(found, expected)
-    assert [int(ours.state[one]["step"]) for one in found] == [5, 4, 5, 5, 5, 5], "one had no gradient once"
+    assert_same(stepped, expected)
+    assert [int(ours.state[one]["step"]) for one in stepped] == [5, 4, 5, 5, 5, 5], "one had no gradient once"
 
     # A checkout's own checkpoint, read by a script without us, and back.
-    other, plain = made(device, betas=betas)
+    other, plain = new_adam(device, betas=betas)
     other = [one.requires_grad_() for one in other]
     with torch.no_grad():
-        for one, trained in zip(other, found, strict=True):
+        for one, trained in zip(other, stepped, strict=True):
             one.copy_(trained)
     plain.load_state_dict(copy.deepcopy(ours.state_dict()))
-    step(found, ours, 5), step(other, plain, 5), step(expected, theirs, 5)
-    assert_same(found, expected)
+    step(stepped, ours, 5), step(other, plain, 5), step(expected, theirs, 5)
+    assert_same(stepped, expected)
     assert_same(other, expected)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_an_optimizer_fused_by_its_script(device: str, works: None) -> None:
-    (found, ours), (expected, theirs) = made(device, fused=True), made(device)
+    (stepped, ours), (expected, theirs) = new_adam(device, fused=True), new_adam(device)
     for seed in range(3):
-        step(found, ours, seed)
+        step(stepped, ours, seed)
         step(expected, theirs, seed)
         fuse_steps(ours)
-    assert ours.state[found[0]]["step"].device.type == "cpu"
+    assert ours.state[stepped[0]]["step"].device.type == "cpu"
     assert [ours.param_groups[0][name] for name in ("fused", "foreach")] == [None, None], "PyTorch's defaults"
-    assert_same(found, expected)
+    assert_same(stepped, expected)
 
 
 def test_hooks_and_closures_are_called_once(works: None) -> None:
-    parameters, optimizer = made("cpu")
+    parameters, optimizer = new_adam("cpu")
     fuse_steps(optimizer)
     called: list[str] = []
     optimizer.register_step_pre_hook(lambda *_: called.append("before"))
@@ -113,7 +113,7 @@ def test_hooks_and_closures_are_called_once(works: None) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_moments_of_other_gaussians_are_an_error(device: str, works: None) -> None:
-    parameters, optimizer = made(device)
+    parameters, optimizer = new_adam(device)
     fuse_steps(optimizer)
     step(parameters, optimizer, 0)
     state = optimizer.state[parameters[0]]
@@ -150,11 +150,11 @@ def test_what_is_left_alone(make: Callable[[Tensor], torch.optim.Optimizer], wor
 
 def test_without_the_kernel_it_is_pytorchs_fused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: False)
-    (found, ours), (expected, theirs) = made("cpu"), made("cpu")
+    (stepped, ours), (expected, theirs) = new_adam("cpu"), new_adam("cpu")
     for seed in range(3):
-        step(found, ours, seed)
+        step(stepped, ours, seed)
         step(expected, theirs, seed)
         fuse_steps(ours)
     assert type(ours) is torch.optim.Adam
     assert ours.param_groups[0]["fused"] is True
-    assert_same(found, expected)
+    assert_same(stepped, expected)
