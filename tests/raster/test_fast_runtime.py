@@ -49,10 +49,10 @@ def everything(case: Case) -> dict[str, Tensor]:
     (result.image * scenes.pixel_weights(case)).sum().backward()
     assert result.absgrad2d is not None
     assert result.means2d.grad is not None
-    found = {name: value.grad for name, value in case.field.parameters.items() if value.grad is not None}
-    assert len(found) == 5
-    found |= {"image": result.image.detach(), "transmittance": result.transmittance.detach(), "radii": result.radii}
-    return found | {"means2d": result.means2d.grad, "absgrad2d": result.absgrad2d}
+    outputs = {name: value.grad for name, value in case.field.parameters.items() if value.grad is not None}
+    assert len(outputs) == 5
+    outputs |= {"image": result.image.detach(), "transmittance": result.transmittance.detach(), "radii": result.radii}
+    return outputs | {"means2d": result.means2d.grad, "absgrad2d": result.absgrad2d}
 
 
 def assert_same_bits(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
@@ -80,8 +80,8 @@ def test_several_python_threads_render_at_once() -> None:
         expected = [everything(case) for case in cases]
         with ThreadPoolExecutor(4) as pool:
             for _ in range(3):
-                for found, wanted in zip(pool.map(everything, cases), expected, strict=True):
-                    assert_same_bits(found, wanted)
+                for outputs, wanted in zip(pool.map(everything, cases), expected, strict=True):
+                    assert_same_bits(outputs, wanted)
 
 
 def _render_in_child(case: Case, expected: dict[str, Tensor]) -> None:
@@ -308,12 +308,12 @@ def test_compilation_is_reported_once_and_repeated_only_after_a_change(copied_pa
 
 
 @pytest.mark.parametrize("name", ["layout.py", "in_torch.py", "tile_kernels.py"])
-@pytest.mark.parametrize("place", ["", "inside"])
-def test_compiled_code_is_as_old_as_what_it_was_compiled_from(name: str, place: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("folder", ["", "inside"])
+def test_compiled_code_is_as_old_as_what_it_was_compiled_from(name: str, folder: str, tmp_path: Path) -> None:
     """SSIM's constants, for example, are in `in_torch`; compiled kernels hold their values."""
     stamp = compiler._helpers_stamp.__wrapped__
     (tmp_path / "inside").mkdir()
-    file = tmp_path / place / name
+    file = tmp_path / folder / name
     file.write_text("A = 1")
     before = stamp(tmp_path / "inside")
     assert stamp(tmp_path / "inside") == before

@@ -182,10 +182,10 @@ def test_a_gpu_is_timed_without_waiting_for_it(monkeypatch: pytest.MonkeyPatch) 
         breakdown.pause()
         told += time.perf_counter() - start
         torch.cuda.synchronize()
-    found = breakdown.seconds()
+    measured = breakdown.seconds()
     # To mark and launch took 0.7 ms of a round's 7 on the slowest processor seen; waits for the oldest of the unread
     # events would take told to all but their share, 1 - 16/120.
-    assert told < 0.5 * sum(found.values())
+    assert told < 0.5 * sum(measured.values())
     for part, length in lengths.items():
-        assert found[part] == pytest.approx(1e-3 * length * rounds * bursts, rel=0.1), part
-    assert found["loss"] == found["densification"] == found["other"] == 0.0
+        assert measured[part] == pytest.approx(1e-3 * length * rounds * bursts, rel=0.1), part
+    assert measured["loss"] == measured["densification"] == measured["other"] == 0.0

@@ -57,9 +57,9 @@ def allocated() -> int:
     return torch.cuda.memory_allocated()
 
 
-def assert_alike(found: torch.Tensor, expected: torch.Tensor) -> None:
+def assert_alike(actual: torch.Tensor, expected: torch.Tensor) -> None:
     """Compare up to rounding, by which a Gaussian of alpha 1/255 may be skipped or blending may stop one earlier."""
-    apart = (found - expected).abs()
+    apart = (actual - expected).abs()
     assert float((apart > 2e-5).float().mean()) < 1e-4, float(apart.max())  # worst seen: 3 of 246,402
     assert float(apart.max()) < 1e-2  # worst seen 1.7e-3
 
@@ -81,8 +81,8 @@ def test_it_is_the_cpus_image(renderer: HierarchyRenderer) -> None:
 
 
 def test_batches(renderer: HierarchyRenderer) -> None:
-    for found, expected in zip(renderer.render_batch(CAMERAS).composed[0], images(renderer, CAMERAS), strict=True):
-        assert_alike(found, expected)
+    for actual, expected in zip(renderer.render_batch(CAMERAS).composed[0], images(renderer, CAMERAS), strict=True):
+        assert_alike(actual, expected)
 
 
 @pytest.mark.parametrize("keep", [True, False])
@@ -98,9 +98,9 @@ def test_fields_come_when_they_are_needed(renderer: HierarchyRenderer, keep: boo
         offload=FieldOffload(torch.device("cuda"), keep),
     )
     before = allocated()
-    for found, image in zip(images(far, CAMERAS), expected, strict=True):
-        assert_alike(found, image)
-    del found  # an image has 2.7 times as many bytes as all fields
+    for actual, image in zip(images(far, CAMERAS), expected, strict=True):
+        assert_alike(actual, image)
+    del actual  # an image has 2.7 times as many bytes as all fields
     size = sum(value.nbytes for field in waiting.values() for value in field.parameters.values())
     taken = allocated() - before
     if keep:
@@ -129,11 +129,11 @@ def at_once(renderer: HierarchyRenderer) -> HierarchyRenderer:
     return together
 
 
-def assert_same(found: Composition, expected: Composition) -> None:
-    assert found.composed.keys() == expected.composed.keys()
+def assert_same(actual: Composition, expected: Composition) -> None:
+    assert actual.composed.keys() == expected.composed.keys()
     for level, image in expected.composed.items():
         # The same kernels; the background alone is blended by other operations.
-        assert_alike(found.composed[level], image)
+        assert_alike(actual.composed[level], image)
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.1, 0.2, 0.3)])
@@ -146,7 +146,7 @@ def test_all_at_once_is_one_after_the_other(
     for camera in CAMERAS * 4:
         assert_same(together.render(camera), in_turn.render(camera))
     for level in (2, 1, 0):
-        gains = {each: 0.5 + each for each in range(level, 3)}
+        gains = {shown: 0.5 + shown for shown in range(level, 3)}
         assert_same(together.render(CAMERAS[0], level, gains), in_turn.render(CAMERAS[0], level, gains))
 
 
@@ -157,7 +157,7 @@ def test_all_at_once_whatever_the_sizes_of_fields(counts: tuple[int, ...]) -> No
     top = len(counts) - 1
     some = {i: replace(blob_field(n, seed=i), signed=i < top).to("cuda") for i, n in enumerate(counts)}
     # Out of the view, too, and near: where gsplat's projection depends on the size of the image.
-    some = {i: each.with_parameters({"means": 3 * each.means}) for i, each in some.items()}
+    some = {i: field.with_parameters({"means": 3 * field.means}) for i, field in some.items()}
     renderer = HierarchyRenderer(some, len(counts), Pyramid(), GsplatRasterizer(), (0.1, 0.2, 0.3))
     for camera in CAMERAS:
         assert_same(at_once(renderer).render(camera), replace(renderer, concurrent=False).render(camera))

@@ -137,18 +137,18 @@ def test_prefetching_changes_no_image(tmp_path: Path, device: str, where: str) -
 @on_every_device
 @in_every_precision
 def test_bytes_on_a_gpu_are_counted(tmp_path: Path, device: str, where: str, precision: str) -> None:
-    each = 3 * 4 * 5 * ITEM_SIZE[precision]
+    size = 3 * 4 * 5 * ITEM_SIZE[precision]
     with store(tmp_path, where, precision, device) as kept:
         for name in "abc":
             kept.put(name, torch.rand(3, 4, 5))
-        at_rest = 3 * each if where == "gpu" else 0
+        at_rest = 3 * size if where == "gpu" else 0
         assert kept.bytes_on_device == at_rest
         kept.prefetch("b")
-        assert kept.bytes_on_device == (each if device == "cuda" and where != "gpu" else at_rest)
+        assert kept.bytes_on_device == (size if device == "cuda" and where != "gpu" else at_rest)
         kept.get("b")
         assert kept.bytes_on_device == at_rest
         if where == "disk":
-            assert sum(file.stat().st_size for file in (tmp_path / "images").iterdir()) == 3 * each
+            assert sum(file.stat().st_size for file in (tmp_path / "images").iterdir()) == 3 * size
     assert not (tmp_path / "images").exists()
 
 
@@ -166,10 +166,16 @@ def test_the_disk_is_read_in_the_background(tmp_path: Path) -> None:
         with pipe.open("wb") as stream:  # opens when the reader has opened it
             pipe.unlink()
             assert torch.equal(kept.get("other"), torch.zeros(3, 2, 2))
-            sender = threading.Timer(0.05, lambda: (stream.write(contents), stream.flush()))
-            sender.start()
+            sent = threading.Event()
+
+            def send() -> None:
+                sent.set()
+                stream.write(contents)
+                stream.flush()
+
+            threading.Timer(0.05, send).start()
             kept.put("slow", torch.full((3, 2, 2), 5.0))  # waits for the reader, and never mixes with its image
-            assert sender.finished.is_set()
+            assert sent.is_set()
         assert torch.equal(kept.get("slow"), torch.full((3, 2, 2), 5.0))
 
 

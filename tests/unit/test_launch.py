@@ -35,8 +35,8 @@ class Launcher:
 
 class Utils:
     def load_binary(self, name, binary, shared, device):
-        found = object(), binary, 32, 0, 1024
-        return found if module.VERSION >= (3, 4) else found[:4]
+        loaded = object(), binary, 32, 0, 1024
+        return loaded if module.VERSION >= (3, 4) else loaded[:4]
 
     def get_device_properties(self, device):
         return {"max_shared_mem": 100_000}

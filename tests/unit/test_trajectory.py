@@ -63,8 +63,8 @@ def test_an_orbit_of_a_ring_is_that_ring() -> None:
     np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 2]), 4.0, atol=1e-2)
     ways = np.linalg.norm(np.diff(np.concatenate([places, places[:1]]), axis=0), axis=1)
     np.testing.assert_allclose(ways, 2 * 4.0 * math.sin(math.pi / 48), rtol=5e-3)  # closed, and even
-    for camera, place in zip(path, places, strict=True):
-        np.testing.assert_allclose(forward(camera), -place / np.linalg.norm(place), atol=2e-3)
+    for camera, position in zip(path, places, strict=True):
+        np.testing.assert_allclose(forward(camera), -position / np.linalg.norm(position), atol=2e-3)
         assert torch.linalg.det(camera.world_to_camera[:3, :3]).item() == pytest.approx(1.0, abs=1e-5)
 
 

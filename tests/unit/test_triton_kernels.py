@@ -23,8 +23,8 @@ from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics_triton
 
-def close(found, expected, absolute=1e-5, relative=1e-4):
-    torch.testing.assert_close(found, expected, atol=absolute, rtol=relative)
+def close(actual, expected, absolute=1e-5, relative=1e-4):
+    torch.testing.assert_close(actual, expected, atol=absolute, rtol=relative)
 
 torch.set_default_device(DEVICE)
 torch.manual_seed(0)
@@ -36,14 +36,14 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     # Some are behind a camera, some beyond its borders, where the Jacobian is limited, and some too faint.
     means = 2 * torch.randn(n, 3) + torch.tensor([0.0, 0.0, 3.0])
     sh = torch.randn(n, (degree + 1) ** 2, 3) / 2
-    given = Parameters(means, torch.randn(n, 4), 0.5 * torch.randn(n, 3) - 2, 2.5 * torch.randn(n) - 1, sh)
+    field = Parameters(means, torch.randn(n, 4), 0.5 * torch.randn(n, 3) - 2, 2.5 * torch.randn(n) - 1, sh)
     poses, intrinsics = torch.eye(4).repeat(cameras, 1, 1), matrix.repeat(cameras, 1, 1)
     for index, pose in enumerate(poses):
         pose[:3, :3] = _torch_impl._quat_to_rotmat(torch.tensor([1.0, 0.1 * index, -0.05 * index, 0.02]))
         pose[:3, 3] = torch.tensor([0.3 * index, -0.1, 0.2])
     centres = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].contiguous()
     seen_from = DeviceCameras(poses, intrinsics, centres, width, height)
-    leaves = Parameters(*(value.double().requires_grad_() for value in given))
+    leaves = Parameters(*(value.double().requires_grad_() for value in field))
     covariances, _ = _torch_impl._quat_scale_to_covar_preci(
         leaves.quaternions, leaves.log_scales.exp(), compute_preci=False
     )
@@ -51,11 +51,11 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
         leaves.means, covariances, poses.double(), intrinsics.double(), width, height, eps2d=0.3, near_plane=0.2
     )
     opacities = leaves.logits.sigmoid().expand(cameras, -1)
-    directions = [torch.nn.functional.normalize(leaves.means - each, dim=-1) for each in centres.double()]
-    colors = torch.stack([sh_to_color(leaves.sh, each, active, signed=signed) for each in directions])
+    directions = [torch.nn.functional.normalize(leaves.means - centre, dim=-1) for centre in centres.double()]
+    colors = torch.stack([sh_to_color(leaves.sh, direction, active, signed=signed) for direction in directions])
 
-    found = project(given, seen_from, active, signed, with_geometry=True)
-    shown = (found.radii > 0).all(-1)
+    seen = project(field, seen_from, active, signed, with_geometry=True)
+    shown = (seen.radii > 0).all(-1)
     assert 0.3 < shown.float().mean() < 0.7
     # Footprints end where alpha is 1/255, unless they end at 3.33 standard deviations before.
     areas = 1 / (conics[..., :1] * conics[..., 2:] - conics[..., 1:2] ** 2)
@@ -64,21 +64,21 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
     radii = (reach[..., None] * variances.sqrt()).ceil().nan_to_num()
     inside = ((pixels + radii > 0) & (pixels - radii < torch.tensor([width, height]))).all(-1) & (depths >= 0.2)
     radii = torch.where(inside[..., None] & (opacities[..., None] >= 1 / 255), radii, 0.0)
-    assert (found.radii == radii).float().mean() > 0.999  # a radius may be rounded up from another side of a number
-    for one, other in ((found.means2d, pixels), (found.depths, depths)):
+    assert (seen.radii == radii).float().mean() > 0.999  # a radius may be rounded up from another side of a number
+    for one, other in ((seen.means2d, pixels), (seen.depths, depths)):
         close(one[shown].double(), other[shown])
     meant = [0, 1, 2, 3, 4, 5, 8, 9, 10]
     records = records_of(pixels, conics, colors, opacities)
-    close(found.records[shown][:, meant].double(), records[shown][:, meant])
-    assert (found.visible_radii == torch.where(shown, found.radii.amax(-1), 0)).all()
-    close(found.centres.double(), torch.where(shown[..., None], pixels - 0.5, 0.0))
-    alone = project(given, seen_from, active, signed)
+    close(seen.records[shown][:, meant].double(), records[shown][:, meant])
+    assert (seen.visible_radii == torch.where(shown, seen.radii.amax(-1), 0)).all()
+    close(seen.centres.double(), torch.where(shown[..., None], pixels - 0.5, 0.0))
+    alone = project(field, seen_from, active, signed)
     assert alone.visible_radii.numel() == alone.centres.numel() == 0
-    close(alone.records[shown][:, meant], found.records[shown][:, meant], 0.0, 1e-6)
+    close(alone.records[shown][:, meant], seen.records[shown][:, meant], 0.0, 1e-6)
     if active == degree:
-        parts = found.radii[-1], found.means2d[-1], found.depths[-1], found.records[-1]
+        parts = seen.radii[-1], seen.means2d[-1], seen.depths[-1], seen.records[-1]
         placed = [torch.full((n + 40, *part.shape[1:]), -7, dtype=part.dtype) for part in parts]
-        project_into(placed, 30, given, seen_from, cameras - 1, signed)
+        project_into(placed, 30, field, seen_from, cameras - 1, signed)
         assert all((whole[:30] == -7).all() and (whole[30 + n :] == -7).all() for whole in placed)
         assert (placed[0][30 : 30 + n] == parts[0]).all()
         for part, whole in zip(parts[1:3], placed[1:3], strict=True):
@@ -94,15 +94,15 @@ for cameras, (degree, active, signed) in [(1, case) for case in cases] + [(3, ca
         loss = (colors * first[..., :3])[shown].sum() + (opacities * first[..., 3])[shown].sum()
         loss = loss + (pixels * first[..., 4:6])[shown].sum() + (conics * conic)[shown].sum()
         expected = torch.autograd.grad(loss, leaves, retain_graph=True)
-        gradients = project_backward(given, seen_from, active, signed, found.radii, found.records, first, others)
+        gradients = project_backward(field, seen_from, active, signed, seen.radii, seen.records, first, others)
         for one, other in zip(gradients, expected, strict=True):
             worst = float((one - other).abs().max() / other.abs().max())
             assert worst < 1e-5, (cameras, degree, active, signed, worst)  # worst seen 2e-6
-    pixels, radii = found.centres, found.visible_radii
+    pixels, radii = seen.centres, seen.visible_radii
 
     norms, counts = torch.rand(n), torch.rand(n)
-    each = (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1)
-    expected = norms + torch.where(shown, each, 0.0).sum(0), counts + shown.sum(0)
+    lengths = (pixels * torch.tensor([20.0, 15.0])).norm(dim=-1)
+    expected = norms + torch.where(shown, lengths, 0.0).sum(0), counts + shown.sum(0)
     if cameras == 1:
         pixels, radii = pixels[0], radii[0]
     add_statistics_triton(pixels.contiguous(), radii.contiguous(), (40, 30), norms, counts)
@@ -123,9 +123,9 @@ for shape, kind, interleaved in (
     exact = stored.double() / (255 if kind == torch.uint8 else 1)
     losses = photometric_loss_triton(prediction, stored, 0.2), photometric_loss_torch(prediction.double(), exact, 0.2)
     close(losses[0].double(), losses[1])
-    found, expected = (torch.autograd.grad(3 * loss, prediction)[0] for loss in losses)
-    assert found.stride() == prediction.stride()
-    close(found * found.numel(), expected * found.numel(), 1e-4)  # values to 7; worst seen 3e-6
+    gradient, expected = (torch.autograd.grad(3 * loss, prediction)[0] for loss in losses)
+    assert gradient.stride() == prediction.stride()
+    close(gradient * gradient.numel(), expected * gradient.numel(), 1e-4)  # values to 7; worst seen 3e-6
 broken = prediction.detach().clone()
 broken[1, 0, 0] = torch.nan
 assert photometric_loss_triton(broken, stored, 0.2).isnan()
