@@ -1,50 +1,46 @@
-"""CPU stand-ins for the CUDA modules that backbones import: same names, same signatures, same outputs.
+"""Stand-ins for the CUDA modules that backbones import, on a CPU and a GPU: same names, signatures and outputs.
 
     with install("fastgs"):
         import train  # an unmodified checkout's
 
 `install` puts them into `sys.modules`, where `import diff_gaussian_rasterization` finds them; importing this package
-does not. A checkout's `.cuda()` calls have to be redirected by the caller.
+does not. Where there is no GPU, a checkout's `.cuda()` calls have to be redirected by the caller.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-import torch
-from scipy.spatial import cKDTree
-from torch import Tensor
-
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family import fused_ssim
-from lapgs_plugin.family.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
-from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, mean_squared_distance
+from lapgs_plugin.family.neighbours import distances_and_neighbours
+from lapgs_plugin.family.variants import BACKBONES, FORKS, VARIANTS, Variant, rasterizer_module
+from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
 
-__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins"]
+__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "unavailable"]
 
 
-def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType]:
+def stand_ins(variant: str, *, neighbours: bool = False, keep: Collection[str] = ()) -> dict[str, ModuleType]:
     """Return the modules of a checkout of `variant` by their CUDA names: its rasterizer, simple_knn and fused_ssim.
 
     Args:
         variant: a key of `VARIANTS`.
         neighbours: whether simple_knn is the one that returns neighbours beside their distances.
+        keep: packages to leave out, by name, because the checkout's own are used.
 
     Raises:
         UserInputError: there is no such variant.
     """
-    if variant not in VARIANTS:
-        raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
+    names = variant, *_known(variant).beside
     ssim = {"fusedssim": fused_ssim.fusedssim, "fusedssim_backward": fused_ssim.fusedssim_backward}
-    knn = _distances_and_neighbours if neighbours else mean_squared_distance
+    knn = distances_and_neighbours if neighbours else mean_squared_distance
     found = {}
-    for each in (variant, *VARIANTS[variant].beside):
+    for each in names:
         name = VARIANTS[each].module
         for parent in _parents(name):
             found[parent] = _module(parent, {}, package=True)
@@ -56,6 +52,7 @@ def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType
         "simple_knn._C": _module("simple_knn._C", {"distCUDA2": knn}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
     }
+    found = {name: module for name, module in found.items() if name.partition(".")[0] not in keep}
     for full, module in found.items():
         parent, _, child = full.rpartition(".")
         if parent:
@@ -63,18 +60,19 @@ def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType
     return found
 
 
-def _distances_and_neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `mean_squared_distance` (n,), and three neighbours of each point (n, 3) int32, the nearest first.
+def unavailable(variant: str) -> str:
+    """Return what our version of a variant's rasterizer cannot do, in words; empty if it does all.
 
-    With fewer than four points, those that do not exist are 0.
+    Raises:
+        UserInputError: there is no such variant.
     """
-    positions, count = points.detach().to("cpu", torch.float64).numpy(), min(NEIGHBOURS + 1, len(points))
-    found = cKDTree(positions).query(positions, k=range(1, count + 1))[1]  # (n, count)
-    others = found != np.arange(len(found))[:, None]
-    others[others.all(1), -1] = False  # points at the same position were found instead of the point itself
-    neighbours = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32)
-    neighbours[:, : count - 1] = torch.from_numpy(found[others].reshape(len(points), count - 1))
-    return mean_squared_distance(points), neighbours
+    return _known(variant).unavailable
+
+
+def _known(variant: str) -> Variant:
+    if variant not in VARIANTS:
+        raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
+    return VARIANTS[variant]
 
 
 def _parents(name: str) -> list[str]:
@@ -84,7 +82,7 @@ def _parents(name: str) -> list[str]:
 
 
 @contextmanager
-def install(variant: str, *, neighbours: bool = False) -> Iterator[dict[str, ModuleType]]:
+def install(variant: str, *, neighbours: bool = False, keep: Collection[str] = ()) -> Iterator[dict[str, ModuleType]]:
     """Let imports of the CUDA modules find the stand-ins inside the block.
 
     Modules that imported them keep them. Arguments are those of `stand_ins`.
@@ -92,7 +90,7 @@ def install(variant: str, *, neighbours: bool = False) -> Iterator[dict[str, Mod
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
     """
-    found = stand_ins(variant, neighbours=neighbours)
+    found = stand_ins(variant, neighbours=neighbours, keep=keep)
     taken = sorted(found.keys() & sys.modules.keys())
     if taken:
         raise UserInputError(f"{taken[0]} is already imported; install stand-ins before the checkout's modules")

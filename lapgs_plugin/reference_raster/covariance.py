@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster.layout import (
+    BLUR,
     FACTOR_SCALE,
     FACTOR_XX,
     FACTOR_XY,
@@ -22,7 +23,6 @@ from lapgs_plugin.reference_raster.layout import (
     FOCAL_X,
     FOCAL_Y,
     NEAR_DEPTH,
-    PIXEL_VARIANCE,
     ROTATION,
     SLOT,
     SPLAT,
@@ -35,7 +35,7 @@ from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_
 from lapgs_plugin.reference_raster.pipeline import Kept, View
 
 MIN_SHARE = 2.5e-5
-"""Lower bound, in antialiasing, of the determinant without the 0.3 px^2 over that with it."""
+"""Lower bound, in antialiasing, of the determinant without the blur over that with it."""
 
 
 def matrices(covariances: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """Return entries xx, xy, yy (n, 3) of the 2D covariances in px^2, without the 0.3 px^2.
+    """Return entries xx, xy, yy (n, 3) of the 2D covariances in px^2, without the blur.
 
     Behind the camera they have no meaning.
 
@@ -81,38 +81,39 @@ def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor
 
 
 class _Antialiasing(torch.autograd.Function):
-    """Map 2D covariances (n, 3) without the 0.3 px^2 to factors (n,) on the opacities."""
+    """Map 2D covariances (n, 3) without the blur, and its variance, to factors (n,) on the opacities."""
 
     @staticmethod
-    def forward(ctx: Any, covariances: Tensor) -> Tensor:
+    def forward(ctx: Any, covariances: Tensor, blur: float) -> Tensor:
         xx, xy, yy = covariances.unbind(1)
-        wide = covariances + covariances.new_tensor([PIXEL_VARIANCE, 0, PIXEL_VARIANCE])
+        wide = covariances + covariances.new_tensor([blur, 0, blur])
         share = (xx * yy - xy * xy) / (wide[:, 0] * wide[:, 2] - xy * xy)
         factors = share.clamp_min(MIN_SHARE).sqrt()
         ctx.save_for_backward(wide, share, factors)
+        ctx.blur = blur
         return factors
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_factors: Tensor) -> Tensor:
+    def backward(ctx: Any, grad_factors: Tensor) -> tuple[Tensor, None]:
         wide, share, factors = ctx.saved_tensors
         x, z, y = wide.unbind(1)
-        w = PIXEL_VARIANCE
-        # DEPARTURE: the CUDA code differentiates the share at covariances that already have the 0.3 px^2, and not at
-        # those that the share is computed from.
+        w = ctx.blur
+        # DEPARTURE: the CUDA code differentiates the share at covariances that already have the blur, and not at those
+        # that the share is computed from.
         d_share = torch.where(share <= MIN_SHARE, 0.0, grad_factors / (2 * factors))
         common = w * d_share / ((x + w) * (y + w) - z * z) ** 2
         return torch.stack([(w * y + y * y + z * z) * common, -2 * z * (w + x + y) * common,
-                            (w * x + x * x + z * z) * common], 1)  # fmt: skip
+                            (w * x + x * x + z * z) * common], 1), None  # fmt: skip
 
 
 def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + 0.3 px^2|).
+    """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + blur|).
 
     They are computed in float64, because the determinant of a long Gaussian is a small difference of large products.
     """
     on_screen = screen_covariances(means.double(), covariances.double(), view)
-    factors: Tensor = _Antialiasing.apply(on_screen)  # type: ignore[no-untyped-call]  # torch's
+    factors: Tensor = _Antialiasing.apply(on_screen, float(view.camera[BLUR]))  # type: ignore[no-untyped-call]  # torch's
     return factors[:, None].to(means.dtype)
 
 
