@@ -64,6 +64,7 @@ class Variant:
         beside: variants of other modules that the same checkouts import.
         needs_logs: whether these checkouts cannot do without TensorBoard.
         unavailable: what ours cannot do, in words; empty if it does all that the CUDA module does.
+        renders_gaussians: whether its image is that of the Gaussians that it is given.
     """
 
     description: str
@@ -79,6 +80,7 @@ class Variant:
     beside: tuple[str, ...] = ()
     needs_logs: bool = False
     unavailable: str = ""
+    renders_gaussians: bool = True
 
 
 def _with_inverse_depths(settings: Any, output: Output) -> tuple[Tensor, ...]:
@@ -246,6 +248,7 @@ FORKS = {
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
         module="diff_surfel_rasterization",
         binding=forks.Surfels,
+        renders_gaussians=False,
         unavailable="intersections of rays with surfels, median depths, distortion; it renders very flat Gaussians",
     ),
     "faster-gs": Variant(

@@ -22,6 +22,7 @@ from lapgs_plugin.reference_raster.layout import (
     FACTOR_YY,
     FOCAL_X,
     FOCAL_Y,
+    MIN_SHARE,
     NEAR_DEPTH,
     ROTATION,
     SLOT,
@@ -33,9 +34,6 @@ from lapgs_plugin.reference_raster.layout import (
 )
 from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
 from lapgs_plugin.reference_raster.pipeline import Kept, View
-
-MIN_SHARE = 2.5e-5
-"""Lower bound, in antialiasing, of the determinant without the blur over that with it."""
 
 
 def matrices(covariances: Tensor) -> Tensor:

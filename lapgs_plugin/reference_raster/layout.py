@@ -20,6 +20,8 @@ NEAR_DEPTH = 0.2
 PIXEL_VARIANCE = 0.3
 """Added to the diagonal of the 2D covariance unless a rasterizer says otherwise, in px^2: a Gaussian is never thinner
 than about a pixel."""
+MIN_SHARE = 2.5e-5
+"""Lower bound, in antialiasing, of the determinant without the blur over that with it."""
 JACOBIAN_LIMIT = 1.3
 """The Jacobian is taken at most this many half image sides away from the optical axis."""
 RADIUS_SIGMAS = 3.0
