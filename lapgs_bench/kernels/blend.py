@@ -16,13 +16,13 @@ from lapgs_bench.kernels.random_scene import make_scene
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.gpu_raster.cameras import CameraCache
+from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, TILE, Parameters, grid_of
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, TILE, Parameters, grid_of
 from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape
+    from lapgs_plugin.gpu_raster.blend_kernels import Shape
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def parse_shapes(text: str | None) -> dict[str, Shape]:
     Raises:
         UserInputError: an entry is not one or two powers of 2, or has too many rows or Gaussians, or too few rows.
     """
-    from lapgs_plugin.rasterizers.gsplat import blend_kernels
+    from lapgs_plugin.gpu_raster import blend_kernels
 
     if text is None:
         text = "x".join(map(str, blend_kernels.SHAPE))
@@ -139,7 +139,7 @@ def gsplats_kernels(given: Sorted, size: tuple[int, int]) -> Kernels:
 
 def our_kernels(given: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
     """Return ours, in one shape."""
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_backward, blend_forward
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         images, counts, words = blended

@@ -15,10 +15,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.blend_kernels import FAINTEST, INTERPRETED, load_four
+from lapgs_plugin.gpu_raster.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
 from lapgs_plugin.ops.launch import blocks, launch
-from lapgs_plugin.rasterizers.gsplat.blend_kernels import FAINTEST, INTERPRETED, load_four
-from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 BLOCK = 128

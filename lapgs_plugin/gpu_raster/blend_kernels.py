@@ -23,8 +23,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.records import GRADIENT, RECORD, TILE, grid_of
 from lapgs_plugin.ops.launch import launch
-from lapgs_plugin.rasterizers.gsplat.records import GRADIENT, RECORD, TILE, grid_of
 
 WARP = 32
 COLUMNS = 4

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError
-from lapgs_plugin.rasterizers.gsplat.bindings import compiled_functions, sort_by_gsplat
-from lapgs_plugin.rasterizers.gsplat.records import grid_of
+from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
+from lapgs_plugin.gpu_raster.records import grid_of
 
 MARGIN, FORGOTTEN = 1.125, 0.02
 """Room by the number of pairs of the last renders, and the share of it that is given up with each render."""
@@ -49,13 +49,13 @@ def blend_in_tiles(
     Raises:
         DeviceMemoryError: there are 2**31 pairs or more.
     """
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_forward
 
     radii, means2d, depths, records = projected[:4]
     if records.is_cuda and (compiled := compiled_functions()) is not None:
         tiles = sort_by_gsplat(compiled, radii, means2d, depths, of_image, count, size)
         return tiles, blend_forward(records, background, *tiles, size, count)
-    from lapgs_plugin.rasterizers.gsplat.tile_kernels import sort_by_depth, sort_by_tile
+    from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid)

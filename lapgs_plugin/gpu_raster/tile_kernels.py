@@ -11,8 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.records import TILE
 from lapgs_plugin.ops.launch import blocks, launch
-from lapgs_plugin.rasterizers.gsplat.records import TILE
 
 BLOCK = 256
 """Gaussians, pairs or tiles of a program."""
