@@ -24,7 +24,9 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.gpu_raster.records import GRADIENT, RECORD, TILE, grid_of
+from lapgs_plugin.gpu_raster.rules import GSPLAT, Rules
 from lapgs_plugin.ops.launch import launch
+from lapgs_plugin.reference_raster.layout import MAX_ALPHA
 
 WARP = 32
 COLUMNS = 4
@@ -35,7 +37,7 @@ AT_ONCE, QUEUE = tl.constexpr(2 * WARP), tl.constexpr(4 * WARP)
 OF_GRADIENT = tl.constexpr(GRADIENT)
 LOG2_E = tl.constexpr(1.4426950408889634)
 FAINTEST = tl.constexpr(1 / 255)
-OPAQUEST = tl.constexpr(0.999)
+OPAQUEST, OPAQUEST_OF_FAMILY = tl.constexpr(0.999), tl.constexpr(MAX_ALPHA)
 LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
 INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
@@ -166,23 +168,33 @@ def _sum_of_pair(one: tl.tensor, other: tl.tensor, bit: tl.constexpr) -> tl.tens
 
 
 @triton.jit
+def meets(
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, limit: tl.tensor, share: tl.constexpr,
+    width: tl.constexpr, height: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return whether half the squared distance from a centre is within a limit at some point of [0, w] x [0, h].
+
+    The distance is convex, so that it is least on a side that faces the centre, or is 0 at the centre. Of its terms
+    that are squares only a share counts.
+    """
+    near_x = tl.minimum(tl.maximum(x - width, 0.0), x)  # difference to the nearest column
+    near_y = tl.minimum(tl.maximum(y - height, 0.0), y)
+    on_column = tl.minimum(tl.maximum(-b * near_x * _inverse(c), y - height), y)
+    on_row = tl.minimum(tl.maximum(-b * near_y * _inverse(a), x - width), x)
+    square = 0.5 * (a * near_x * near_x + c * on_column * on_column)
+    found = square * share + b * near_x * on_column <= limit
+    square = 0.5 * (a * on_row * on_row + c * near_y * near_y)
+    return found | (square * share + b * on_row * near_y <= limit)
+
+
+@triton.jit
 def _reaches(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     width: tl.constexpr, height: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
-    """Return whether alpha may reach `FAINTEST` at a pixel; x and y are centres relative to the first pixel's.
-
-    The exponent is convex, so that it is least on a side of the region that faces the centre, or is 0 at the centre.
-    """
-    near_x = tl.minimum(tl.maximum(x - (width - 1), 0.0), x)  # difference to the nearest column
-    near_y = tl.minimum(tl.maximum(y - (height - 1), 0.0), y)
-    on_column = tl.minimum(tl.maximum(-b * near_x * _inverse(c), y - (height - 1)), y)
-    on_row = tl.minimum(tl.maximum(-b * near_y * _inverse(a), x - (width - 1)), x)
+    """Return whether alpha may reach `FAINTEST` at a pixel; x and y are centres relative to the first pixel's."""
     limit = tl.log(opacity / FAINTEST) + 0.01  # with room for rounding, which grows with the terms of the exponent
-    square = 0.5 * (a * near_x * near_x + c * on_column * on_column)
-    found = square * 0.99999 + b * near_x * on_column <= limit
-    square = 0.5 * (a * on_row * on_row + c * near_y * near_y)
-    return found | (square * 0.99999 + b * on_row * near_y <= limit)
+    return meets(x, y, a, b, c, limit, 0.99999, width - 1, height - 1)
 
 
 @triton.jit
@@ -207,10 +219,14 @@ def _pairs_of(index: tl.tensor, offsets: tl.tensor, known: int, pairs: int) -> t
 @triton.jit(do_not_specialize=("across", "tiles", "known", "pairs"))
 def _reach_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
-    across: int, tiles: int, known: int, pairs: int,
+    across: int, tiles: int, known: int, pairs: int, mult: float,
     columns: tl.constexpr, rows: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, threads: tl.constexpr,
+    snug: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Write which of the tile's pairs reach each of its regions, a bit for each pair."""
+    """Write which of the tile's pairs reach each of its regions, a bit for each pair.
+
+    `snug` leaves out those whose ellipse, which `mult` shrinks, does not meet the tile.
+    """
     index = tl.program_id(0)
     row, column = (index % tiles) // across * tile, (index % tiles) % across * tile
     regions: tl.constexpr = (tile // columns) * (tile // rows)
@@ -223,6 +239,8 @@ def _reach_kernel(
         x, y, a, b = load_four(records + record * gaussian)
         c, opacity, _, _ = load_four(records + record * gaussian + 4)
         x, y = x - (column + 0.5), y - (row + 0.5)
+        if snug:
+            there = there & meets(x, y, a, b, c, mult * tl.log(opacity / FAINTEST), 1.0, tile, tile)
         word = tl.zeros((threads,), tl.int32)  # of the region that has a thread's number in its warp
         for region in tl.static_range(regions):
             left, top = region % (tile // columns) * columns, region // (tile // columns) * rows
@@ -286,7 +304,7 @@ def _bucket(
     queue: tl.tensor, head: tl.tensor, tail: tl.tensor, another: tl.tensor, records: tl.tensor,
     splats: tl.constexpr, record: tl.constexpr,
 ) -> tuple[tl.tensor, ...]:  # fmt: skip
-    """Load the queue's next bucket: the Gaussians, whether they are there, and x, y, a, b, c, opacity and colours.
+    """Load the queue's next bucket: Gaussians, whether they are there, x, y, a, b, c, opacity, colours and 1 / depth.
 
     Those that are not there have the numbers of the last Gaussian, or of `another`, which are finite.
     """
@@ -296,20 +314,33 @@ def _bucket(
     gaussian = tl.load(queue + (tl.minimum(order, tail - 1) & (QUEUE - 1)), tail > 0, another)
     x, y, a, b = load_four(records + record * gaussian)
     c, opacity, _, _ = load_four(records + record * gaussian + 4)
-    red, green, blue, _ = load_four(records + record * gaussian + 8)
+    red, green, blue, inverse_z = load_four(records + record * gaussian + 8)
     tl.debug_barrier()  # tells the assembler that all threads are here, which saves registers and branches
-    return gaussian, order < tail, x, y, a, b, c, opacity, red, green, blue
+    return gaussian, order < tail, x, y, a, b, c, opacity, red, green, blue, inverse_z
 
 
 @triton.jit
 def _alphas(
-    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor, there: tl.tensor
-) -> tl.tensor:
-    """Return alphas, 0 where they are below `FAINTEST`; `x` and `y` are centres less pixels."""
+    x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor, there: tl.tensor,
+    family: tl.constexpr,
+) -> tuple[tl.tensor, tl.tensor]:  # fmt: skip
+    """Return alphas, 0 where they are below `FAINTEST`, and as they were; `x` and `y` are centres less pixels."""
     # The exponent of 2; most of it is the same in all rows.
     power = (a * (-0.5 * LOG2_E)) * x * x + y * (b * (-LOG2_E) * x + c * (-0.5 * LOG2_E) * y)
-    alpha = tl.minimum(opacity * _exp2(power), OPAQUEST)
-    return tl.where(there & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0)
+    density = opacity * _exp2(power)
+    alpha = tl.minimum(density, OPAQUEST_OF_FAMILY if family else OPAQUEST)
+    return tl.where(there & (power <= 0.0) & (alpha >= FAINTEST), alpha, 0.0), density
+
+
+@triton.jit
+def _pixels(
+    image: tl.tensor, place: tl.tensor, size: tl.tensor, planar: tl.constexpr
+) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
+    """Return where red, green and blue of pixels are in images (c, h, w, 3), or (c, 3, h, w) if `planar`."""
+    start = 3 * (image.to(tl.int64) * size)
+    if planar:
+        return start + place, start + size + place, start + 2 * size + place
+    return start + 3 * place, start + 3 * place + 1, start + 3 * place + 2
 
 
 @triton.jit
@@ -328,9 +359,10 @@ def _transmittances(alpha: tl.tensor, transmittance: tl.tensor) -> tuple[tl.tens
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "of_background"))
 def _forward_kernel(
     records: tl.tensor, background: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
-    images: tl.tensor, counts: tl.tensor, queues: tl.tensor,
+    images: tl.tensor, inverse_depths: tl.tensor, counts: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int, of_background: int,
-    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
+    rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, family: tl.constexpr,
+    depth: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel.
     bucket: tl.constexpr = splats * SPLAT_LANES
@@ -342,6 +374,7 @@ def _forward_kernel(
     transmittance = tl.where(inside, 1.0, 0.0)
     # Sums over the Gaussians of each thread.
     red, green, blue, cover = inside * 0.0, inside * 0.0, inside * 0.0, inside * 0.0
+    near = inside * 0.0
 
     begin, stop = _pairs_of(index, offsets, known, pairs)
     words += _first_word(index, begin, regions) + tl.program_id(0) % regions
@@ -351,7 +384,7 @@ def _forward_kernel(
     begin, words, tail, gaussians, word = _fill(
         queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
     )
-    _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
+    _, there, x, y, a, b, c, opacity, color_r, color_g, color_b, inverse_z = _bucket(
         queue, head, tail, another, records, splats, record
     )
     while head < tail:
@@ -361,32 +394,37 @@ def _forward_kernel(
             queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
         )
         following = _bucket(queue, head, tail, another, records, splats, record)
-        alpha = _alphas(x - (column + 0.5 + along), y - (row + 0.5 + down), a, b, c, opacity, there)
+        alpha, _ = _alphas(x - (column + 0.5 + along), y - (row + 0.5 + down), a, b, c, opacity, there, family)
         before, after, transmittance = _transmittances(alpha, transmittance)
         weight = tl.where(after > LEAST, alpha * before, 0.0)
         red += tl.sum(weight * color_r, 2, keep_dims=True)
         green += tl.sum(weight * color_g, 2, keep_dims=True)
         blue += tl.sum(weight * color_b, 2, keep_dims=True)
         cover += tl.sum(weight, 2, keep_dims=True)
+        if depth:
+            near += tl.sum(weight * inverse_z, 2, keep_dims=True)
         if tl.max((transmittance > LEAST).to(tl.int32)) == 0:  # all pixels ended
             begin, tail = stop, head
-        _, there, x, y, a, b, c, opacity, color_r, color_g, color_b = following
+        _, there, x, y, a, b, c, opacity, color_r, color_g, color_b, inverse_z = following
     tl.store(counts + tl.program_id(0), tl.minimum(head, tail))
 
-    pixel = images + 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
+    place = (row + down) * width + column + along
+    at_red, at_green, at_blue = _pixels(image, place, width * height, family)
     left = 1.0 - tl.sum(cover, 1, keep_dims=True)
     background += of_background * image
-    tl.store(pixel, tl.sum(red, 1, keep_dims=True) + left * tl.load(background), inside)
-    tl.store(pixel + 1, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
-    tl.store(pixel + 2, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
+    tl.store(images + at_red, tl.sum(red, 1, keep_dims=True) + left * tl.load(background), inside)
+    tl.store(images + at_green, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
+    tl.store(images + at_blue, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
+    if depth:
+        tl.store(inverse_depths + place, tl.sum(near, 1, keep_dims=True), inside)
 
 
 @triton.jit
 def _add_gradients(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
-    gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
-    absolute: tl.constexpr,
+    by_inverse_z: tl.tensor, gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
+    absolute: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     """Add a bucket's gradients, summed over pixels, to those of all tiles.
 
@@ -409,24 +447,27 @@ def _add_gradients(
     start = gradients + OF_GRADIENT * gaussian
     tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
     tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
-    value = tl.sum(0.5 * by_yy, 0, keep_dims=True)
+    # The others: by c, two absolute sums, by 1 / depth.
+    each: tl.constexpr = 1 + (2 if absolute else 0) + (1 if depth else 0)
+    value = tl.where(lane == 0, tl.sum(0.5 * by_yy, 0, keep_dims=True), 0.0)
     if absolute:
         along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3, keep_dims=True), 0, keep_dims=True)
         along_y = tl.sum(tl.sum(tl.abs(by_sigma * (b * x + c * y)), 3, keep_dims=True), 0, keep_dims=True)
-        value = tl.where(lane == 0, value, tl.where(lane == 1, along_x, along_y))
-        tl.atomic_add(others + 3 * gaussian + lane, value, there & (lane < 3), sem="relaxed")
-    else:
-        tl.atomic_add(others + gaussian, tl.where(lane == 0, value, 0.0), there & (lane == 0), sem="relaxed")
+        value = tl.where(lane == 1, along_x, tl.where(lane == 2, along_y, value))
+    if depth:
+        total = tl.sum(tl.sum(by_inverse_z, 3, keep_dims=True), 0, keep_dims=True)
+        value = tl.where(lane == each - 1, total, value)
+    tl.atomic_add(others + each * gaussian + lane, value, there & (lane < each), sem="relaxed")
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def _backward_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor,
-    counts: tl.tensor, images: tl.tensor, by_images: tl.tensor,
+    counts: tl.tensor, images: tl.tensor, by_images: tl.tensor, inverse_depths: tl.tensor, by_depths: tl.tensor,
     gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
-    absolute: tl.constexpr,
+    absolute: tl.constexpr, family: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
@@ -437,11 +478,16 @@ def _backward_kernel(
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
-    pixel = 3 * (image.to(tl.int64) * (width * height) + (row + down) * width + column + along)
-    red = tl.load(by_images + pixel, inside, 0.0)
-    green, blue = tl.load(by_images + pixel + 1, inside, 0.0), tl.load(by_images + pixel + 2, inside, 0.0)
-    behind = red * tl.load(images + pixel, inside, 0.0)
-    behind += green * tl.load(images + pixel + 1, inside, 0.0) + blue * tl.load(images + pixel + 2, inside, 0.0)
+    place = (row + down) * width + column + along
+    at_red, at_green, at_blue = _pixels(image, place, width * height, family)
+    red = tl.load(by_images + at_red, inside, 0.0)
+    green, blue = tl.load(by_images + at_green, inside, 0.0), tl.load(by_images + at_blue, inside, 0.0)
+    behind = red * tl.load(images + at_red, inside, 0.0)
+    behind += green * tl.load(images + at_green, inside, 0.0) + blue * tl.load(images + at_blue, inside, 0.0)
+    near = inside * 0.0
+    if depth:
+        near = tl.load(by_depths + place, inside, 0.0)
+        behind += near * tl.load(inverse_depths + place, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
     second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
@@ -455,28 +501,35 @@ def _backward_kernel(
         begin, words, tail, gaussians, word = _fill(
             queue, begin, stop, head, tail, gaussians, word, flat, words, regions, bucket
         )
-        gaussian, there, x, y, a, b, c, opacity, color_r, color_g, color_b = _bucket(
+        gaussian, there, x, y, a, b, c, opacity, color_r, color_g, color_b, inverse_z = _bucket(
             queue, head, tail, another, records, splats, record
         )
         head += bucket
         x = x - (column + 0.5 + along)  # (LANES, SPLAT_LANES, splats, 1)
         y = y - (row + 0.5 + down)  # (LANES, SPLAT_LANES, splats, rows)
-        alpha = _alphas(x, y, a, b, c, opacity, there)
+        alpha, density = _alphas(x, y, a, b, c, opacity, there, family)
         inverse = _inverse(1.0 - alpha)
         before, after, transmittance = _transmittances(alpha, transmittance)
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
         weight = alpha * before
-        added = weight * (color_r * red + color_g * green + color_b * blue)
+        shade = color_r * red + color_g * green + color_b * blue
+        if depth:
+            shade += inverse_z * near
+        added = weight * shade
         by_both = tl.sum(added, 2, keep_dims=True)
         by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
         added_before, by_all = _before(by_both, adds=True)
         still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
         behind -= by_all
         # The gradient by alpha, times -alpha.
-        by_sigma = tl.where(alpha < OPAQUEST, still_behind * (alpha * inverse) - added, 0.0)
+        by_sigma = still_behind * (alpha * inverse) - added
+        if family:  # the gradient passes the limit
+            by_sigma *= tl.maximum(density * (1.0 / OPAQUEST_OF_FAMILY), 1.0)
+        else:
+            by_sigma = tl.where(alpha < OPAQUEST, by_sigma, 0.0)
         _add_gradients(
-            x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue,
-            gaussian, there, gradients, others, absolute,
+            x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue, weight * near,
+            gaussian, there, gradients, others, absolute, depth,
         )  # fmt: skip
 
 
@@ -484,7 +537,7 @@ def blend_forward(
     records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], count: int,
     shape: Shape = SHAPE,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Blend the Gaussians of each tile; arguments are contiguous.
+    """Blend the Gaussians of each tile by gsplat's rules; arguments are contiguous.
 
     Args:
         records: (c, n, RECORD) float32 of c cameras, or (n, RECORD) of several images' Gaussians in one list; numbers
@@ -501,58 +554,91 @@ def blend_forward(
         Images (c, h, w, 3); the number of Gaussians in each region that reach it before all its pixels end; and
         words whose bits say which pairs reach a region.
     """
-    width, height = size
-    programs, numbers = _launch_of(offsets, flat, size, count, shape)
+    images = records.new_empty(count, size[1], size[0], 3)
+    return images, *_blend(records, background, offsets, flat, images, images, GSPLAT, 1.0, shape)
+
+
+def blend_family(
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], rules: Rules,
+    mult: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Blend the Gaussians of each tile by the family's rules; arguments are contiguous.
+
+    Args:
+        records, background, offsets, flat, size: as `blend_forward` takes them; of one camera.
+        mult: as in `kernels.Numbers`.
+
+    Returns:
+        Image (1, 3, h, w); 1 / depth (1, h, w), empty without `rules.depth`; and counts and words as `blend_forward`.
+    """
+    image = records.new_empty(1, 3, size[1], size[0])
+    inverse_depths = records.new_empty(1, *((size[1], size[0]) if rules.depth else (0, 0)))
+    return image, inverse_depths, *_blend(records, background, offsets, flat, image, inverse_depths, rules, mult, SHAPE)
+
+
+def _blend(
+    records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, inverse_depths: Tensor,
+    rules: Rules, mult: float, shape: Shape,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    programs, numbers = _launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
     words = flat.new_empty((len(flat) // WARP + len(offsets)) * shape.regions)
     launch(
         _reach_kernel, (programs // shape.regions,),
-        records, offsets, flat, words, *numbers[2:],
-        columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS,
+        records, offsets, flat, words, *numbers[2:], mult,
+        columns=COLUMNS, rows=shape.rows, tile=TILE, record=RECORD, threads=WARP * REACH_WARPS, snug=rules.snug,
         num_warps=REACH_WARPS,
     )  # fmt: skip
-    images = records.new_empty(count, height, width, 3)
     counts = flat.new_empty(programs)
     launch(
         _forward_kernel, (programs,),
-        records, background, offsets, flat, words, images, counts, flat.new_empty(programs, QUEUE.value),
+        records, background, offsets, flat, words, images, inverse_depths, counts,
+        flat.new_empty(programs, QUEUE.value),
         *numbers, 3 if background.ndim == 2 else 0, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        num_warps=1, maxnreg=FORWARD_REGISTERS,
+        family=rules.family, depth=rules.depth, num_warps=1, maxnreg=FORWARD_REGISTERS,
     )  # fmt: skip
-    return images, counts, words
+    return counts, words
 
 
 def blend_backward(
     records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, counts: Tensor, words: Tensor,
-    by_images: Tensor, absolute: bool, shape: Shape = SHAPE,
+    by_images: Tensor, absolute: bool, shape: Shape = SHAPE, rules: Rules = GSPLAT,
+    inverse_depths: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the gradients of blending by what it read of each Gaussian; arguments are contiguous.
 
     Args:
         records: (c, n, RECORD).
         offsets, flat: as `blend_forward` takes them.
-        images, counts, words: its results, made with the same shape.
+        images, counts, words: its results, or those of `blend_family`, made with the same shape.
         by_images: gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
+        rules: those that the images were made by.
+        inverse_depths: with `rules.depth`, the result of `blend_family` and the gradient by it.
 
     Returns:
-        Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and (c, n, 1) by c, or (c, n, 3) with
-        the absolute sums of those by x and y.
+        Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and (c, n, 1 to 4) by c, the absolute
+        sums of those by x and y if asked for, and that by 1 / depth with `rules.depth`.
     """
-    programs, numbers = _launch_of(offsets, flat, (images.shape[2], images.shape[1]), len(images), shape)
+    programs, numbers = _launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
     assert len(counts) == programs
-    count, each = records.numel() // RECORD, 3 if absolute else 1
+    count, each = records.numel() // RECORD, 1 + 2 * absolute + rules.depth
     zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     launch(
         _backward_kernel, (programs,),
-        records, offsets, flat, words, counts, images, by_images, found, others,
+        records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)), found, others,
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, num_warps=1, maxnreg=BACKWARD_REGISTERS,
+        absolute=absolute, family=rules.family, depth=rules.depth, num_warps=1, maxnreg=BACKWARD_REGISTERS,
     )  # fmt: skip
     leading = records.shape[:-1]
     return found.view(*leading, GRADIENT), others.view(*leading, each)
+
+
+def _size_of(images: Tensor, rules: Rules) -> tuple[int, int]:
+    """Return (width, height)."""
+    return (images.shape[3], images.shape[2]) if rules.family else (images.shape[2], images.shape[1])
 
 
 def _launch_of(

@@ -1,33 +1,47 @@
 """Project Gaussians and evaluate their colours for several cameras at once, and the gradients of both, in Triton.
 
 A thread has a Gaussian and goes from camera to camera: parameters are read, and the gradients by them summed, once for
-all cameras. The formulas and limits of projection are gsplat's (`projection_ewa_3dgs_fused`); where it limits the
-Jacobian, so do we.
+all cameras. The formulas and limits of projection are gsplat's (`projection_ewa_3dgs_fused`) or those of the 3DGS
+family, see `rules.Rules`; where they limit the Jacobian, so do we.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.gpu_raster.blend_kernels import FAINTEST, INTERPRETED, load_four
+from lapgs_plugin.gpu_raster.blend_kernels import FAINTEST, INTERPRETED, load_four, meets
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
-from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, GRADIENT, RECORD, Parameters, Projected
+from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, GRADIENT, RECORD, TILE, Parameters, Projected
+from lapgs_plugin.gpu_raster.rules import GSPLAT, Rules
 from lapgs_plugin.ops.launch import blocks, launch
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.layout import (
+    JACOBIAN_LIMIT,
+    MAX_RADIUS,
+    MIN_ROOT,
+    NEAR_DEPTH,
+    PIXEL_VARIANCE,
+    RADIUS_SIGMAS,
+)
 
 BLOCK = 128
 """Gaussians of a program."""
-NEAR, BLUR = tl.constexpr(NEAR_DEPTH), tl.constexpr(PIXEL_VARIANCE)
+NEAR = tl.constexpr(NEAR_DEPTH)
 REACH = tl.constexpr(3.33)
 """Standard deviations at which every footprint ends, as gsplat has it; fainter Gaussians end where alpha is 1/255."""
 BEYOND = tl.constexpr(0.3)
 """The Jacobian is that of a point this share of half the image beyond its border at most."""
+CENTRED, SIGMAS, LEAST_ROOT = tl.constexpr(JACOBIAN_LIMIT), tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
+"""The family's: the Jacobian's limit in half images from the centre, and numbers of its three-sigma radius."""
+LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
+LEAST_SHARE = tl.constexpr(2.5e-5)
+"""Lower bound, where Gaussians are dimmed, of the determinant without the blur over that with it."""
 
 # Kernels are only compiled anew for another number of coefficients: the active degree grows during a stage, and bases
 # and residuals alternate.
@@ -216,12 +230,28 @@ def _covariance(
 
 
 @triton.jit
-def _shape(quaternions: tl.tensor, log_scales: tl.tensor, row: tl.tensor) -> tl.tensor:
-    """Return w, x, y, z of unit quaternions and one over their length, scales, and covariances as `_covariance` has."""
-    w, x, y, z, length = _unit_quaternions(quaternions, row)
+def _shape(
+    quaternions: tl.tensor, scales: tl.tensor, row: tl.tensor, modifier: float, family: tl.constexpr,
+    covariances: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return w, x, y, z of quaternions and one over their length, scales, and covariances as `_covariance` has.
+
+    Given covariances have no quaternions and scales, which are 0.
+    """
+    if covariances:
+        xx, xy, xz = _load_three(scales + 6 * row)
+        yy, yz, zz = _load_three(scales + 6 * row + 3)
+        none = 0.0 * xx
+        return none, none, none, none, none, none, none, none, xx, xy, xz, yy, yz, zz
+    s0, s1, s2 = _load_three(scales + 3 * row)
+    if family:
+        w, x, y, z = load_four(quaternions + 4 * row)
+        length = 0.0 * w + 1.0
+        s0, s1, s2 = s0 * modifier, s1 * modifier, s2 * modifier
+    else:
+        w, x, y, z, length = _unit_quaternions(quaternions, row)
+        s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
     a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
-    s0, s1, s2 = _load_three(log_scales + 3 * row)
-    s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
     xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
     return w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz
 
@@ -243,7 +273,7 @@ def _direction(centre: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, visi
 @triton.jit
 def _seen_from(
     poses: tl.tensor, intrinsics: tl.tensor, camera: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor,
-    width: int, height: int,
+    width: int, height: int, family: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return a mean in a camera's image plane, and the Jacobian's numbers there.
 
@@ -257,9 +287,14 @@ def _seen_from(
     inverse = 1.0 / tl.where(ahead >= NEAR, ahead, 1.0)
     u, v = right * inverse, down * inverse
     fx, cx, fy, cy = tl.load(matrix), tl.load(matrix + 2), tl.load(matrix + 4), tl.load(matrix + 5)
-    past, under = BEYOND * 0.5 * width / fx, BEYOND * 0.5 * height / fy
-    limited_u = tl.minimum((width - cx) / fx + past, tl.maximum(-(cx / fx + past), u))
-    limited_v = tl.minimum((height - cy) / fy + under, tl.maximum(-(cy / fy + under), v))
+    if family:
+        past, under = CENTRED * 0.5 * width / fx, CENTRED * 0.5 * height / fy
+        limited_u = tl.minimum(past, tl.maximum(-past, u))
+        limited_v = tl.minimum(under, tl.maximum(-under, v))
+    else:
+        past, under = BEYOND * 0.5 * width / fx, BEYOND * 0.5 * height / fy
+        limited_u = tl.minimum((width - cx) / fx + past, tl.maximum(-(cx / fx + past), u))
+        limited_v = tl.minimum((height - cy) / fy + under, tl.maximum(-(cy / fy + under), v))
     return (
         u, v, limited_u, limited_v, inverse, ahead,
         fx * inverse, -fx * limited_u * inverse, fy * inverse, -fy * limited_v * inverse,
@@ -291,13 +326,29 @@ def _times(
 
 
 @triton.jit
-def _color(
-    sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int, coefficients: tl.constexpr
+def _coefficient(
+    first: tl.tensor, sh: tl.tensor, row: tl.tensor, k: tl.constexpr, coefficients: tl.constexpr, apart: tl.constexpr
 ) -> tl.tensor:
-    """Return red, green and blue of rows seen in unit directions, by the first `active` coefficients."""
+    """Return where the k-th coefficient of each row is in memory: in `first` (n, 1, 3), if that is apart, or `sh`."""
+    if apart:
+        return first + 3 * row if k == 0 else sh + row * (3 * (coefficients - 1)) + 3 * (k - 1)
+    return sh + row * (3 * coefficients) + 3 * k
+
+
+@triton.jit
+def _color(
+    first: tl.tensor, sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
+    coefficients: tl.constexpr, apart: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return red, green and blue of rows seen in unit directions, by the first `active` coefficients.
+
+    Without coefficients `sh` (n, 3) are the colours.
+    """
+    if coefficients == 0:
+        return _load_three(sh + 3 * row)
     start = sh + row * (3 * coefficients)
     red, green, blue = 0.0 * x, 0.0 * x, 0.0 * x
-    if coefficients % 4 == 0:  # then rows begin at multiples of 16 bytes
+    if coefficients % 4 == 0 and not apart:  # then rows begin at multiples of 16 bytes
         for k in tl.static_range(0, coefficients, 4):
             if k < active:  # coefficients that are not in use are 0 or wait for their degree
                 r0, g0, b0, r1 = load_four(start + 3 * k)
@@ -311,7 +362,7 @@ def _color(
     else:
         for k in tl.static_range(coefficients):
             factor = _used_basis(k, x, y, z, active)
-            r0, g0, b0 = _load_three(start + 3 * k)
+            r0, g0, b0 = _load_three(_coefficient(first, sh, row, k, coefficients, apart))
             red += factor * r0
             green += factor * g0
             blue += factor * b0
@@ -329,62 +380,144 @@ def _used_basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, activ
     return tl.where(_is_used(k, active), _basis(k, x, y, z), 0.0)
 
 
+@triton.jit
+def _tiles_between(low: tl.tensor, high: tl.tensor, tiles: int) -> tl.tensor:
+    """Return the first tile and one past the last, limited to the image, in 16 bits each; 0 if there is none."""
+    # Limited before they are integers: a footprint may reach further than these count.
+    low = tl.minimum(tl.maximum(low, 0.0), tiles * 1.0).to(tl.int32)
+    high = tl.minimum(tl.maximum(high, 0.0), tiles * 1.0).to(tl.int32)
+    return tl.where(low < high, low | (high << 16), 0)
+
+
+@triton.jit
+def _footprint(
+    x: tl.tensor, y: tl.tensor, wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor, opacity: tl.tensor,
+    in_front: tl.tensor, across: int, down: int, mult: float, snug: tl.constexpr, tile: tl.constexpr,
+) -> tl.tensor:  # fmt: skip
+    """Return columns and rows of tiles as `_tiles_between` does, the three-sigma radius, and where that is seen.
+
+    `x` and `y` are pixels, of which the first has its centre at 0.
+    """
+    half = 0.5 * (wide - high)
+    root = tl.sqrt(tl.maximum(half * half + skew * skew, LEAST_ROOT))
+    radius = tl.minimum(tl.ceil(SIGMAS * tl.sqrt(0.5 * (wide + high) + root)), LARGEST)
+    # Comparisons with NaN are false, so that broken parameters are culled here.
+    in_front = in_front & (area < OVERFLOWN) & (tl.abs(x) < OVERFLOWN) & (tl.abs(y) < OVERFLOWN)
+    limit = tl.log(opacity / FAINTEST)  # of half the squared distance, where alpha is `FAINTEST`
+    if snug:
+        limit = mult * limit
+        reach_x, reach_y = tl.sqrt(2.0 * limit * wide), tl.sqrt(2.0 * limit * high)
+        columns = _tiles_between(tl.floor((x - reach_x) / tile), tl.floor((x + reach_x) / tile + 1.0), across)
+        rows = _tiles_between(tl.floor((y - reach_y) / tile), tl.floor((y + reach_y) / tile + 1.0), down)
+        inverse = 1.0 / area
+        shown = in_front & (area > 0.0) & (limit > 0.0) & (columns > 0) & (rows > 0)
+        shown = shown & meets(
+            x, y, high * inverse, -skew * inverse, wide * inverse, limit, 1.0, across * tile * 1.0, down * tile * 1.0
+        )
+        return tl.where(shown, columns, 0), tl.where(shown, rows, 0), radius, shown
+    # As in the CUDA code, a last tile counts only if the square reaches its second pixel.
+    columns = _tiles_between(tl.floor((x - radius) / tile), tl.floor((x + radius + (tile - 1)) / tile), across)
+    rows = _tiles_between(tl.floor((y - radius) / tile), tl.floor((y + radius + (tile - 1)) / tile), down)
+    seen = in_front & (area != 0.0) & (columns > 0) & (rows > 0)
+    # In the other tiles alpha is less than `FAINTEST`, even with rounding.
+    limit = 2.0 * (limit * 1.0001 + 0.01)
+    reach_x, reach_y = tl.sqrt(limit * wide), tl.sqrt(limit * high)
+    left = tl.maximum(tl.floor(tl.ceil(x - reach_x) / tile), (columns & 0xFFFF) * 1.0)
+    right = tl.minimum(tl.floor((x + reach_x) / tile) + 1.0, (columns >> 16) * 1.0)
+    top = tl.maximum(tl.floor(tl.ceil(y - reach_y) / tile), (rows & 0xFFFF) * 1.0)
+    bottom = tl.minimum(tl.floor((y + reach_y) / tile) + 1.0, (rows >> 16) * 1.0)
+    shown = seen & (area > 0.0) & (limit > 0.0)
+    columns, rows = _tiles_between(left, right, across), _tiles_between(top, bottom, down)
+    shown = shown & (columns > 0) & (rows > 0)
+    return tl.where(shown, columns, 0), tl.where(shown, rows, 0), radius, seen
+
+
+@triton.jit
+def _dimming(wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor) -> tl.tensor:
+    """Return the factors on opacities of antialiasing, and the shares that they are the roots of.
+
+    Of the arguments `area` alone has the blur.
+    """
+    share = (wide * high - skew * skew) / area
+    return tl.sqrt(tl.maximum(share, LEAST_SHARE)), share
+
+
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
 def _project_kernel(
-    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor, sh: tl.tensor,
-    poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor,
+    means: tl.tensor, quaternions: tl.tensor, scales: tl.tensor, opacities: tl.tensor, sh: tl.tensor,
+    first_sh: tl.tensor, poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor,
     radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, records: tl.tensor,
     visible_radii: tl.tensor, visible_pixels: tl.tensor,
     width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
+    modifier: float, blur: float, mult: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
+    tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
+    snug: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
     mean_x, mean_y, mean_z = _load_three(means + 3 * row)
-    _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(quaternions, log_scales, row)
-    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
-    reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
+    _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(quaternions, scales, row, modifier, family, covariances)
+    opacity = tl.load(opacities + row)
+    if not family:
+        opacity = 1.0 / (1.0 + tl.exp(-opacity))
+        reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
     camera, placed = first, start + rows
     while camera < first + cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
-        u, v, _, _, _, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height
+        u, v, _, _, near, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, family
         )
         matrix = intrinsics + 9 * camera
         pixel_x = tl.load(matrix) * u + tl.load(matrix + 2)
         pixel_y = tl.load(matrix + 4) * v + tl.load(matrix + 5)
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, by_x, x_by_z, by_y, y_by_z)
         cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
-        wide = px * cov_x + py * cov_y + pz * cov_z + BLUR
+        sharp_wide = px * cov_x + py * cov_y + pz * cov_z
         skew = qx * cov_x + qy * cov_y + qz * cov_z
         cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
-        high = qx * cov_x + qy * cov_y + qz * cov_z + BLUR
+        sharp_high = qx * cov_x + qy * cov_y + qz * cov_z
+        wide, high = sharp_wide + blur, sharp_high + blur
         area = wide * high - skew * skew
-        across, down = tl.ceil(reach * tl.sqrt(wide)), tl.ceil(reach * tl.sqrt(high))
-        visible = here & (depth >= NEAR) & (area > 0.0) & (opacity >= FAINTEST) & (across > 0.0) & (down > 0.0)
-        visible = visible & (pixel_x + across > 0.0) & (pixel_x - across < width)
-        visible = visible & (pixel_y + down > 0.0) & (pixel_y - down < height)
+        effective = opacity
+        if dimmed:
+            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area)[0]
+        if family:
+            in_columns, in_rows, radius, seen = _footprint(
+                pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective, here & (depth > NEAR),
+                (width + tile - 1) // tile, (height + tile - 1) // tile, mult, snug, tile,
+            )  # fmt: skip
+            visible = in_columns > 0
+            tl.store(radii + 2 * placed, in_columns, here)
+            tl.store(radii + 2 * placed + 1, in_rows, here)
+            tl.store(depths + placed, tl.where(seen, depth, 0.0), here)
+        else:
+            across, down = tl.ceil(reach * tl.sqrt(wide)), tl.ceil(reach * tl.sqrt(high))
+            visible = here & (depth >= NEAR) & (area > 0.0) & (opacity >= FAINTEST) & (across > 0.0) & (down > 0.0)
+            visible = visible & (pixel_x + across > 0.0) & (pixel_x - across < width)
+            visible = visible & (pixel_y + down > 0.0) & (pixel_y - down < height)
+            across, down = tl.where(visible, across, 0.0).to(tl.int32), tl.where(visible, down, 0.0).to(tl.int32)
+            seen, radius = visible, tl.maximum(across, down)
+            tl.store(radii + 2 * placed, across, here)
+            tl.store(radii + 2 * placed + 1, down, here)
+            tl.store(pixels + 2 * placed, pixel_x, visible)
+            tl.store(pixels + 2 * placed + 1, pixel_y, visible)
+            tl.store(depths + placed, depth, visible)
 
         x, y, z, _ = _direction(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
         colored = tl.where(visible, row, 0)  # so that memory of others is not read
-        red, green, blue = _color(sh, colored, x, y, z, active, coefficients)
-        if signed == 0:
+        red, green, blue = _color(first_sh, sh, colored, x, y, z, active, coefficients, apart)
+        if coefficients > 0 and signed == 0:
             red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
 
-        across, down = tl.where(visible, across, 0.0).to(tl.int32), tl.where(visible, down, 0.0).to(tl.int32)
-        tl.store(radii + 2 * placed, across, here)
-        tl.store(radii + 2 * placed + 1, down, here)
-        tl.store(pixels + 2 * placed, pixel_x, visible)
-        tl.store(pixels + 2 * placed + 1, pixel_y, visible)
-        tl.store(depths + placed, depth, visible)
         inverse = 1.0 / area
         into = records + placed * record
         _store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
-        _store_four(into + 4, wide * inverse, opacity, opacity, opacity, visible)
-        _store_four(into + 8, red, green, blue, blue, visible)
+        _store_four(into + 4, wide * inverse, effective, effective, effective, visible)
+        _store_four(into + 8, red, green, blue, near, visible)
         if with_geometry:
-            tl.store(visible_radii + placed, tl.maximum(across, down), here)
-            tl.store(visible_pixels + 2 * placed, tl.where(visible, pixel_x - 0.5, 0.0), here)
-            tl.store(visible_pixels + 2 * placed + 1, tl.where(visible, pixel_y - 0.5, 0.0), here)
+            tl.store(visible_radii + placed, tl.where(seen, radius, 0).to(tl.int32), here)
+            tl.store(visible_pixels + 2 * placed, tl.where(seen, pixel_x - 0.5, 0.0), here)
+            tl.store(visible_pixels + 2 * placed + 1, tl.where(seen, pixel_y - 0.5, 0.0), here)
         camera += 1
         placed += n
 
@@ -408,10 +541,12 @@ def _of_covariance(
 @triton.jit
 def _grad_of_mean(
     pose: tl.tensor, u: tl.tensor, v: tl.tensor, limited_u: tl.tensor, limited_v: tl.tensor, inverse: tl.tensor,
-    x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor,
-    fx: tl.tensor, fy: tl.tensor, fz: tl.tensor, gx: tl.tensor, gy: tl.tensor, gz: tl.tensor,
+    x_by_x: tl.tensor, y_by_y: tl.tensor, of_x: tl.tensor, of_y: tl.tensor, of_depth: tl.tensor,
+    fx: tl.tensor, fy: tl.tensor, fz: tl.tensor, gx: tl.tensor, gy: tl.tensor, gz: tl.tensor, family: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
-    """Return the gradient by a mean from those by its pixel, x and y, and by the projection's rows, halved, f and g.
+    """Return the gradient by a mean from those by its pixel, x and y, its depth, and the projection's rows, f and g.
+
+    These last ones are halved.
 
     The others are results of `_seen_from`.
     """
@@ -420,12 +555,16 @@ def _grad_of_mean(
     r8, r9, r10 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
     of_x_by_x, of_y_by_y = 2.0 * (fx * r0 + fy * r1 + fz * r2), 2.0 * (gx * r4 + gy * r5 + gz * r6)
     of_x_by_z, of_y_by_z = 2.0 * (fx * r8 + fy * r9 + fz * r10), 2.0 * (gx * r8 + gy * r9 + gz * r10)
-    # The Jacobian's entries are f / z and -f u / z; where u is limited, it does not depend on the mean.
+    # The Jacobian's entries are f / z and -f u / z; where u is limited, it does not depend on the mean. In the CUDA
+    # code of the family, u z does not.
     free_u, free_v = limited_u == u, limited_v == v
+    twice_u, twice_v = tl.where(free_u, 2.0, 1.0), tl.where(free_v, 2.0, 1.0)
+    if family:
+        twice_u, twice_v = 2.0, 2.0
     right = x_by_x * (of_x - tl.where(free_u, of_x_by_z * inverse, 0.0))
     down = y_by_y * (of_y - tl.where(free_v, of_y_by_z * inverse, 0.0))
-    ahead = -x_by_x * (u * of_x + inverse * (of_x_by_x - tl.where(free_u, 2.0, 1.0) * limited_u * of_x_by_z))
-    ahead -= y_by_y * (v * of_y + inverse * (of_y_by_y - tl.where(free_v, 2.0, 1.0) * limited_v * of_y_by_z))
+    ahead = of_depth - x_by_x * (u * of_x + inverse * (of_x_by_x - twice_u * limited_u * of_x_by_z))
+    ahead -= y_by_y * (v * of_y + inverse * (of_y_by_y - twice_v * limited_v * of_y_by_z))
     return (
         r0 * right + r4 * down + r8 * ahead,
         r1 * right + r5 * down + r9 * ahead,
@@ -435,62 +574,104 @@ def _grad_of_mean(
 
 @triton.jit
 def _store_shape_gradients(
-    by_quaternion: tl.tensor, by_log_scale: tl.tensor, rows: tl.tensor, here: tl.tensor,
+    by_quaternion: tl.tensor, by_scale: tl.tensor, rows: tl.tensor, here: tl.tensor,
     w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, length: tl.tensor,
     s0: tl.tensor, s1: tl.tensor, s2: tl.tensor,
-    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
+    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor, family: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances."""
+    """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances.
+
+    As in the family's CUDA code, that by its scales lacks the factor that they were multiplied by.
+    """
     a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
     # By the columns of the rotation, without their factor of twice the square of the scale.
     ux, uy, uz = _times(xx, xy, xz, yy, yz, zz, a, d, g)
     vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, b, e, h)
     wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
-    s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
     by_0, by_1, by_2 = ux * a + uy * d + uz * g, vx * b + vy * e + vz * h, wx * c + wy * f + wz * i
-    _store_three(by_log_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
+    if family:
+        _store_three(by_scale + 3 * rows, 2.0 * s0 * by_0, 2.0 * s1 * by_1, 2.0 * s2 * by_2, here)
+    s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
+    if not family:
+        _store_three(by_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
     ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
     of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
     of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
     of_y = 2.0 * (x * (vx + uy) - 2.0 * y * (ux + wz) + z * (wy + vz) + w * (wx - uz))
     of_z = 2.0 * (x * (wx + uz) + y * (wy + vz) - 2.0 * z * (ux + vy) + w * (uy - vx))
-    along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
-    of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
+    if not family:
+        along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
+        of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
     _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
+
+
+@triton.jit
+def _dimming_backward(
+    sharp_wide: tl.tensor, skew: tl.tensor, sharp_high: tl.tensor, blur: float, of_factor: tl.tensor,
+    visible: tl.tensor,
+) -> tl.tensor:  # fmt: skip
+    """Return the factors on opacities, and what they add to the gradients by xx, by xy and yx each, and by yy."""
+    wide, high = sharp_wide + blur, sharp_high + blur
+    factor, share = _dimming(sharp_wide, skew, sharp_high, wide * high - skew * skew)
+    of_share = tl.where(visible & (share > LEAST_SHARE), of_factor / (2.0 * factor), 0.0)
+    # The CUDA code differentiates the share at covariances that already have the blur, and not at those that it is
+    # computed from.
+    larger = (wide + blur) * (high + blur) - skew * skew
+    common = blur * of_share / (larger * larger)
+    return (
+        factor, (blur * high + high * high + skew * skew) * common, -skew * (blur + wide + high) * common,
+        (blur * wide + wide * wide + skew * skew) * common,
+    )  # fmt: skip
 
 
 @triton.jit(do_not_specialize=("width", "height", "n", "cameras"))
 def _shape_gradient_kernel(
-    means: tl.tensor, quaternions: tl.tensor, log_scales: tl.tensor, logits: tl.tensor,
+    means: tl.tensor, quaternions: tl.tensor, scales: tl.tensor, opacities: tl.tensor,
     poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor, others: tl.tensor,
-    by_mean: tl.tensor, by_quaternion: tl.tensor, by_log_scale: tl.tensor, by_logit: tl.tensor,
-    width: int, height: int, n: int, cameras: int,
+    by_mean: tl.tensor, by_quaternion: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
+    by_color: tl.tensor, by_screen: tl.tensor,
+    width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
     record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
+    colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
+    dimmed: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
     mean_x, mean_y, mean_z = _load_three(means + 3 * row)
-    w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz = _shape(quaternions, log_scales, row)
+    w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz = _shape(
+        quaternions, scales, row, modifier, family, covariances
+    )
     none = 0.0 * mean_x
-    by_x, by_y, by_z, by_opacity = none, none, none, none
+    by_x, by_y, by_z, total = none, none, none, none
     by_xx, by_xy, by_xz, by_yy, by_yz, by_zz = none, none, none, none, none, none
     camera = 0
     while camera < cameras:
         placed = camera * n + row
         visible = _is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        _, _, _, of_opacity = load_four(found + placed * gradient)
+        red, green, blue, of_opacity = load_four(found + placed * gradient)
         of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
         of_high = tl.load(others + placed * each)
         _, _, conic_a, conic_b = load_four(records + placed * record)
         conic_c = tl.load(records + placed * record + 4)
-        by_opacity += tl.where(visible, of_opacity, 0.0)
+        of_opacity = tl.where(visible, of_opacity, 0.0)
         of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
         wide, skew, high = _of_covariance(of_wide, of_skew, of_high, conic_a, conic_b, conic_c, visible)
         u, v, limited_u, limited_v, inverse, _, x_by_x, x_by_z, y_by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, family
         )
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, x_by_x, x_by_z, y_by_y, y_by_z)
+        if dimmed:
+            cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
+            of_xx, of_xy = px * cov_x + py * cov_y + pz * cov_z, qx * cov_x + qy * cov_y + qz * cov_z
+            cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
+            of_yy = qx * cov_x + qy * cov_y + qz * cov_z
+            factor, of_xx, of_xy, of_yy = _dimming_backward(
+                of_xx, of_xy, of_yy, blur, of_opacity * tl.load(opacities + row), visible
+            )
+            wide, skew, high = wide + of_xx, skew + of_xy, high + of_yy
+            of_opacity = tl.where(visible, of_opacity * factor, 0.0)
+        total += of_opacity
         # By the rows of the projection, halved; and by the covariance in the world.
         fx, fy, fz = wide * px + skew * qx, wide * py + skew * qy, wide * pz + skew * qz
         gx, gy, gz = skew * px + high * qx, skew * py + high * qy, skew * pz + high * qz
@@ -502,20 +683,52 @@ def _shape_gradient_kernel(
         by_zz += fz * pz + gz * qz
         fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
-        right, down, ahead = _grad_of_mean(
-            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, fx, fy, fz, gx, gy, gz
-        )
+        of_depth = none
+        if depth:  # the last of the others is by 1 / depth
+            of_inverse = tl.load(others + placed * each + (each - 1))
+            of_depth = tl.where(visible, -of_inverse * inverse * inverse, 0.0)
+        right, under, ahead = _grad_of_mean(
+            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, of_depth,
+            fx, fy, fz, gx, gy, gz, family,
+        )  # fmt: skip
         by_x += right
-        by_y += down
+        by_y += under
         by_z += ahead
+        if colored:
+            red, green = tl.where(visible, red, 0.0), tl.where(visible, green, 0.0)
+            _store_three(by_color + 3 * rows, red, green, tl.where(visible, blue, 0.0), here)
+        if columns > 0:
+            _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * each, 0.5 * width,
+                                    0.5 * height, visible, here, columns)  # fmt: skip
         camera += 1
     _store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
-    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + row)))
-    tl.store(by_logit + rows, by_opacity * opacity * (1.0 - opacity), here)
-    _store_shape_gradients(
-        by_quaternion, by_log_scale, rows, here, w, x, y, z, length, s0, s1, s2,
-        by_xx, by_xy, by_xz, by_yy, by_yz, by_zz,
-    )  # fmt: skip
+    if not family:
+        opacity = 1.0 / (1.0 + tl.exp(-tl.load(opacities + row)))
+        total *= opacity * (1.0 - opacity)
+    tl.store(by_opacity + rows, total, here)
+    if covariances:
+        _store_three(by_scale + 6 * rows, by_xx, 2.0 * by_xy, 2.0 * by_xz, here)
+        _store_three(by_scale + 6 * rows + 3, by_yy, 2.0 * by_yz, by_zz, here)
+    else:
+        _store_shape_gradients(
+            by_quaternion, by_scale, rows, here, w, x, y, z, length, s0, s1, s2,
+            by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, family,
+        )  # fmt: skip
+
+
+@triton.jit
+def _store_screen_gradients(
+    into: tl.tensor, of_x: tl.tensor, of_y: tl.tensor, others: tl.tensor, half_width: tl.tensor, half_height: tl.tensor,
+    visible: tl.tensor, here: tl.tensor, columns: tl.constexpr,
+) -> None:  # fmt: skip
+    """Store the gradients by centres in half images; of four columns the last two are sums of absolute values."""
+    tl.store(into, of_x * half_width, here)
+    tl.store(into + 1, of_y * half_height, here)
+    if columns == 4:
+        tl.store(into + 2, tl.where(visible, tl.load(others + 1) * half_width, 0.0), here)
+        tl.store(into + 3, tl.where(visible, tl.load(others + 2) * half_height, 0.0), here)
+    else:
+        tl.store(into + 2, 0.0 * of_x, here)
 
 
 @triton.jit
@@ -531,13 +744,13 @@ def _slopes(
 
 @triton.jit
 def _by_direction(
-    sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
-    of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor, coefficients: tl.constexpr,
+    first: tl.tensor, sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
+    of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor, coefficients: tl.constexpr, apart: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return the gradient by x, y and z of the directions from that by colours."""
     start = sh + row * (3 * coefficients)
     by_x, by_y, by_z = 0.0 * x, 0.0 * x, 0.0 * x
-    if coefficients % 4 == 0:
+    if coefficients % 4 == 0 and not apart:
         for k in tl.static_range(0, coefficients, 4):
             if k < active:
                 r0, g0, b0, r1 = load_four(start + 3 * k)
@@ -551,8 +764,8 @@ def _by_direction(
                 by_y += y0 + y1 + y2 + y3
                 by_z += z0 + z1 + z2 + z3
     else:
-        for k in tl.static_range(coefficients):
-            r0, g0, b0 = _load_three(start + 3 * k)
+        for k in tl.static_range(1, coefficients):  # the first one is the same in all directions
+            r0, g0, b0 = _load_three(_coefficient(first, sh, row, k, coefficients, apart))
             x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
             by_x += x0
             by_y += y0
@@ -568,11 +781,11 @@ def _one_of(sums: tl.tensor, k: tl.tensor, one: tl.constexpr) -> tl.tensor:
 
 @triton.jit
 def _store_sh(
-    by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor, k: tl.tensor, here: tl.tensor,
-    coefficients: tl.constexpr,
+    by_first: tl.tensor, by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor,
+    k: tl.tensor, here: tl.tensor, coefficients: tl.constexpr, apart: tl.constexpr,
 ) -> None:  # fmt: skip
     """Store red, green and blue (k, g) of each coefficient."""
-    if coefficients % 4 == 0:
+    if coefficients % 4 == 0 and not apart:
         for i in tl.static_range(0, coefficients, 4):
             into = by_sh + (rows * coefficients + i) * 3
             r0, g0, b0, r1 = _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), _one_of(red, k, i + 1)
@@ -583,17 +796,17 @@ def _store_sh(
             _store_four(into + 8, b2, r3, _one_of(green, k, i + 3), _one_of(blue, k, i + 3), here)
     else:
         for i in tl.static_range(coefficients):
-            into = by_sh + (rows * coefficients + i) * 3
+            into = _coefficient(by_first, by_sh, rows, i, coefficients, apart)
             _store_three(into, _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), here)
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def _color_gradient_kernel(
-    means: tl.tensor, centres: tl.tensor, sh: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor,
-    by_mean: tl.tensor, by_sh: tl.tensor,
+    means: tl.tensor, centres: tl.tensor, sh: tl.tensor, first_sh: tl.tensor, radii: tl.tensor, records: tl.tensor,
+    found: tl.tensor, by_mean: tl.tensor, by_sh: tl.tensor, by_first: tl.tensor,
     n: tl.tensor, cameras: int, active: int, signed: int,
     record: tl.constexpr, color_in_record: tl.constexpr, gradient: tl.constexpr,
-    coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr,
+    coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr, apart: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -621,36 +834,104 @@ def _color_gradient_kernel(
         blue += basis * of_blue[None]
         if coefficients > 1:
             source = tl.where(visible, row, 0)
-            in_x, in_y, in_z = _by_direction(sh, source, x, y, z, active, of_red, of_green, of_blue, coefficients)
+            in_x, in_y, in_z = _by_direction(
+                first_sh, sh, source, x, y, z, active, of_red, of_green, of_blue, coefficients, apart
+            )
             radial = in_x * x + in_y * y + in_z * z  # moving along the direction does not change it
             by_x += (in_x - radial * x) * near
             by_y += (in_y - radial * y) * near
             by_z += (in_z - radial * z) * near
         camera += 1
-    _store_sh(by_sh, rows, red, green, blue, k, here, coefficients)
+    _store_sh(by_first, by_sh, rows, red, green, blue, k, here, coefficients, apart)
     if coefficients > 1:
         before_x, before_y, before_z = _load_three(by_mean + 3 * row)
         _store_three(by_mean + 3 * rows, before_x + by_x, before_y + by_y, before_z + by_z, here)
 
 
+@triton.jit(do_not_specialize=("width", "height", "down_1", "right_1", "down_2", "right_2"))
+def _camera_kernel(
+    view: tl.tensor, full: tl.tensor, pose: tl.tensor, intrinsics: tl.tensor,
+    width: int, height: int, down_1: int, right_1: int, down_2: int, right_2: int, tan_x: float, tan_y: float,
+) -> None:  # fmt: skip
+    """Write a camera as other kernels read it from transposed matrices, of any strides, as the CUDA code takes them."""
+    number = tl.arange(0, 16)
+    tl.store(pose + number, tl.load(view + number % 4 * down_1 + number // 4 * right_1))
+    # The axis of the camera in the world, by the rotation's inverse: R (r0 x r1) is along it.
+    a, b, c = tl.load(view), tl.load(view + down_1), tl.load(view + 2 * down_1)
+    d, e, f = tl.load(view + right_1), tl.load(view + down_1 + right_1), tl.load(view + 2 * down_1 + right_1)
+    g, h, i = (
+        tl.load(view + 2 * right_1), tl.load(view + down_1 + 2 * right_1), tl.load(view + 2 * down_1 + 2 * right_1)
+    )  # fmt: skip
+    x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
+    inverse = 1.0 / (x * g + y * h + z * i)
+    across = (tl.load(full) * x + tl.load(full + down_2) * y + tl.load(full + 2 * down_2) * z) * inverse
+    full += right_2
+    down = (tl.load(full) * x + tl.load(full + down_2) * y + tl.load(full + 2 * down_2) * z) * inverse
+    tl.store(intrinsics, 0.5 * width / tan_x)
+    tl.store(intrinsics + 2, 0.5 * width * (1.0 + across))
+    tl.store(intrinsics + 4, 0.5 * height / tan_y)
+    tl.store(intrinsics + 5, 0.5 * height * (1.0 + down))
+
+
+def camera_of(
+    view: Tensor, full: Tensor, centre: Tensor, tangents: tuple[float, float], size: tuple[int, int]
+) -> DeviceCameras:
+    """Return a camera from transposed matrices on the device, as the CUDA code takes them, without reading them.
+
+    Args:
+        view: (4, 4) world to camera.
+        full: (4, 4) world to clip space; only its principal point is used.
+        centre: (3,) in world coordinates.
+        tangents: of half the fields of view, across and down.
+        size: (width, height).
+    """
+    numbers = view.new_empty(28)
+    pose, intrinsics = numbers[:16], numbers[16:25]
+    launch(
+        _camera_kernel, (1,),
+        view, full, pose, intrinsics, *size, *view.stride(), *full.stride(), *(float(value) for value in tangents),
+    )  # fmt: skip
+    return DeviceCameras(pose.view(1, 4, 4), intrinsics.view(1, 3, 3), centre.reshape(1, 3).contiguous(), *size)
+
+
+class Numbers(NamedTuple):
+    """Hold numbers of the family's rules.
+
+    Attributes:
+        modifier: factor on standard deviations.
+        blur: added to the diagonal of the 2D covariance, in px^2.
+        mult: factor on half the squared distance at which alpha is 1/255, for the ellipse of `Rules.snug`.
+    """
+
+    modifier: float = 1.0
+    blur: float = PIXEL_VARIANCE
+    mult: float = 1.0
+
+
+NUMBERS = Numbers()
+
+
 def project(
-    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False
-) -> Projected:
+    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
+    rules: Rules = GSPLAT, numbers: Numbers = NUMBERS, first: Tensor | None = None,
+) -> Projected:  # fmt: skip
     """Project at least one Gaussian, and evaluate its colour.
 
     Args:
         degree: highest of SH to evaluate.
         signed: whether colours are the raw SH values.
         with_geometry: fill in visible radii and centres.
+        rules, numbers: those of `given`, too.
+        first: (n, 1, 3) first coefficients, if they are apart.
     """
     count, n, like = len(cameras.poses), len(given.means), given.means
     integers = like.new_empty(count, n, 2, dtype=torch.int32)
     described = n if with_geometry else 0
     made = Projected(
-        integers, like.new_empty(count, n, 2), like.new_empty(count, n), like.new_empty(count, n, RECORD),
-        integers.new_empty(count, described), like.new_empty(count, described, 2),
+        integers, like.new_empty(count, 0 if rules.family else n, 2), like.new_empty(count, n),
+        like.new_empty(count, n, RECORD), integers.new_empty(count, described), like.new_empty(count, described, 2),
     )  # fmt: skip
-    _project(given, cameras, (0, count), degree, signed, made, 0, with_geometry)
+    _project(given, first, cameras, (0, count), degree, signed, made, 0, with_geometry, rules, numbers)
     return made
 
 
@@ -666,18 +947,26 @@ def project_into(
         given, cameras, signed: as `project` takes them; all coefficients are evaluated.
     """
     made = Projected(*stacked, *stacked[:2])
-    _project(given, cameras, (camera, 1), math.isqrt(given.sh.shape[1]) - 1, signed, made, start, with_geometry=False)
+    degree = math.isqrt(given.sh.shape[1]) - 1
+    _project(given, None, cameras, (camera, 1), degree, signed, made, start, False, GSPLAT, NUMBERS)
+
+
+def _coefficients(sh: Tensor, rules: Rules) -> int:
+    """Return the number of SH coefficients, 0 if there are colours (n, 3) instead."""
+    return sh.shape[1] + rules.apart if sh.ndim == 3 else 0
 
 
 def _project(
-    given: Parameters, cameras: DeviceCameras, chosen: tuple[int, int], degree: int, signed: bool, into: Projected,
-    start: int, with_geometry: bool,
+    given: Parameters, first: Tensor | None, cameras: DeviceCameras, chosen: tuple[int, int], degree: int, signed: bool,
+    into: Projected, start: int, with_geometry: bool, rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
     n = len(given.means)
     launch(
         _project_kernel, (blocks(n, BLOCK),),
-        *given, *cameras[:3], *into, cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start,
-        coefficients=given.sh.shape[1], with_geometry=with_geometry, record=RECORD, block=BLOCK,
+        *given, given.sh if first is None else first, *cameras[:3], *into,
+        cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
+        coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
+        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed, snug=rules.snug,
     )  # fmt: skip
 
 
@@ -693,17 +982,54 @@ def project_backward(
         found, others: gradients (c, n, GRADIENT) and (c, n, 1 or more) as `blend_backward` returns them.
     """
     by = Parameters(*(torch.empty_like(value) for value in given))
-    n, count, coefficients = len(given.means), len(cameras.poses), given.sh.shape[1]
+    _project_backward(
+        given, None, cameras, degree, signed, radii, records, found, others, by, None, None, GSPLAT, NUMBERS
+    )
+    return by
+
+
+def project_family_backward(
+    given: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
+    records: Tensor, found: Tensor, others: Tensor, rules: Rules, numbers: Numbers, columns: int,
+) -> tuple[Parameters, Tensor | None, Tensor]:  # fmt: skip
+    """Return the gradients by parameters, by the first coefficients, and by centres in units of half images.
+
+    Args:
+        given, first, cameras, degree, signed, rules, numbers: arguments of `project`; one camera.
+        radii, records: its results.
+        found, others: as `blend_backward` returns them.
+        columns: of the gradient by centres: 3, or 4 of which the last two are sums of absolute values.
+    """
+    by = Parameters(*(torch.empty_like(value) for value in given))
+    by_first = None if first is None else torch.empty_like(first)
+    by_screen = given.means.new_empty(len(given.means), columns)
+    _project_backward(
+        given, first, cameras, degree, signed, radii, records, found, others, by, by_first, by_screen, rules, numbers
+    )
+    return by, by_first, by_screen
+
+
+def _project_backward(
+    given: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
+    records: Tensor, found: Tensor, others: Tensor, by: Parameters, by_first: Tensor | None, by_screen: Tensor | None,
+    rules: Rules, numbers: Numbers,
+) -> None:  # fmt: skip
+    n, count, coefficients = len(given.means), len(cameras.poses), _coefficients(given.sh, rules)
     launch(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
-        *given[:4], *cameras[:2], radii, records, found, others, *by[:4], cameras.width, cameras.height, n, count,
-        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK,
+        *given[:4], *cameras[:2], radii, records, found, others, *by, by.means if by_screen is None else by_screen,
+        cameras.width, cameras.height, n, count, *numbers[:2],
+        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, colored=coefficients == 0,
+        columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
+        dimmed=rules.dimmed, depth=rules.depth,
     )  # fmt: skip
+    if coefficients == 0:
+        return
     launch(
         _color_gradient_kernel, (blocks(n, BLOCK),),
-        given.means, cameras.centres, given.sh, radii, records, found, by.means, by.sh,
+        given.means, cameras.centres, given.sh, given.sh if first is None else first, radii, records, found,
+        by.means, by.sh, by.sh if by_first is None else by_first,
         n, count, (degree + 1) ** 2, int(signed),
         record=RECORD, color_in_record=COLOR_IN_RECORD, gradient=GRADIENT,
-        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=BLOCK,
+        coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=BLOCK, apart=rules.apart,
     )  # fmt: skip
-    return by
