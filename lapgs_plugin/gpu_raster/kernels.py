@@ -9,24 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.gpu_raster.blend_kernels import FAINTEST, INTERPRETED, load_four, meets
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, GRADIENT, RECORD, TILE, Parameters, Projected
-from lapgs_plugin.gpu_raster.rules import GSPLAT, Rules
+from lapgs_plugin.gpu_raster.rules import GSPLAT, NUMBERS, Numbers, Rules
+from lapgs_plugin.gpu_raster.walk_kernels import FAINTEST, INTERPRETED, load_four, meets
 from lapgs_plugin.ops.launch import blocks, launch
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_RADIUS,
     MIN_ROOT,
     NEAR_DEPTH,
-    PIXEL_VARIANCE,
     RADIUS_SIGMAS,
 )
 
@@ -892,23 +890,6 @@ def camera_of(
         view, full, pose, intrinsics, *size, *view.stride(), *full.stride(), *(float(value) for value in tangents),
     )  # fmt: skip
     return DeviceCameras(pose.view(1, 4, 4), intrinsics.view(1, 3, 3), centre.reshape(1, 3).contiguous(), *size)
-
-
-class Numbers(NamedTuple):
-    """Hold numbers of the family's rules.
-
-    Attributes:
-        modifier: factor on standard deviations.
-        blur: added to the diagonal of the 2D covariance, in px^2.
-        mult: factor on half the squared distance at which alpha is 1/255, for the ellipse of `Rules.snug`.
-    """
-
-    modifier: float = 1.0
-    blur: float = PIXEL_VARIANCE
-    mult: float = 1.0
-
-
-NUMBERS = Numbers()
 
 
 def project(

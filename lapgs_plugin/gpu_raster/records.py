@@ -68,6 +68,22 @@ class Projected(NamedTuple):
     centres: Tensor  # (c, n, 2) as in `RenderResult`; empty unless described
 
 
+class Blended(NamedTuple):
+    """Hold what blending by the family's rules read and made of n Gaussians; see `blend_kernels.blend_family`."""
+
+    records: Tensor
+    offsets: Tensor
+    flat: Tensor
+    image: Tensor  # (1, 3, h, w)
+    counts: Tensor
+    words: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (width, height)."""
+        return self.image.shape[3], self.image.shape[2]
+
+
 def records_of(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> Tensor:
     """Return the records (c, n, RECORD) of Gaussians, (c, n, 2), (c, n, 3), (c, n, 3) and (c, n).
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
+
 
 class Rules(NamedTuple):
     """Tell what kernels are given, and what a Gaussian's footprint is.
@@ -30,3 +32,20 @@ class Rules(NamedTuple):
 
 
 GSPLAT = Rules()
+
+
+class Numbers(NamedTuple):
+    """Hold numbers of the family's rules.
+
+    Attributes:
+        modifier: factor on standard deviations.
+        blur: added to the diagonal of the 2D covariance, in px^2.
+        mult: factor on half the squared distance at which alpha is 1/255, for the ellipse of `Rules.snug`.
+    """
+
+    modifier: float = 1.0
+    blur: float = PIXEL_VARIANCE
+    mult: float = 1.0
+
+
+NUMBERS = Numbers()
