@@ -53,6 +53,12 @@ from lapgs_plugin.gpu_raster.walk_kernels import (
 from lapgs_plugin.ops.launch import launch
 
 OF_GRADIENT = tl.constexpr(GRADIENT)
+OTHERS = {(False, False): 1, (True, False): 3, (False, True): 3, (True, True): 5}
+"""Numbers of a Gaussian's other gradients, by whether there are absolute sums, and 1 / depth.
+
+They are that by c; two absolute sums, or one without meaning; that by 1 / depth. The number is odd, so that addresses
+of several lanes have no order in which Triton would spread them over threads, see `_backward_kernel`.
+"""
 FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
 """At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
 
@@ -125,7 +131,7 @@ def _add_gradients(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
     by_inverse_z: tl.tensor, gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
-    absolute: tl.constexpr, depth: tl.constexpr,
+    absolute: tl.constexpr, depth: tl.constexpr, each: tl.constexpr,
 ) -> None:  # fmt: skip
     """Add a bucket's gradients, summed over pixels, to those of all tiles.
 
@@ -148,17 +154,17 @@ def _add_gradients(
     start = gradients + OF_GRADIENT * gaussian
     tl.atomic_add(start + 2 * lane, first, there, sem="relaxed")
     tl.atomic_add(start + 2 * lane + 1, second, there, sem="relaxed")
-    # The others: by c, two absolute sums, by 1 / depth.
-    each: tl.constexpr = 1 + (2 if absolute else 0) + (1 if depth else 0)
-    value = tl.where(lane == 0, tl.sum(0.5 * by_yy, 0, keep_dims=True), 0.0)
+    value, wanted = tl.sum(0.5 * by_yy, 0, keep_dims=True), lane == 0
     if absolute:
         along_x = tl.sum(tl.sum(tl.abs(by_sigma * (a * x + b * y)), 3, keep_dims=True), 0, keep_dims=True)
         along_y = tl.sum(tl.sum(tl.abs(by_sigma * (b * x + c * y)), 3, keep_dims=True), 0, keep_dims=True)
-        value = tl.where(lane == 1, along_x, tl.where(lane == 2, along_y, value))
+        value = tl.where(lane == 0, value, tl.where(lane == 1, along_x, along_y))
+        wanted = lane < 3
     if depth:
         total = tl.sum(tl.sum(by_inverse_z, 3, keep_dims=True), 0, keep_dims=True)
-        value = tl.where(lane == each - 1, total, value)
-    tl.atomic_add(others + each * gaussian + lane, value, there & (lane < each), sem="relaxed")
+        value = tl.where(lane == each // 2 + 1, total, value)
+        wanted = wanted | (lane == each // 2 + 1)
+    tl.atomic_add(others + each * gaussian + lane, tl.where(wanted, value, 0.0), there & wanted, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
@@ -168,7 +174,7 @@ def _backward_kernel(
     gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
-    absolute: tl.constexpr, family: tl.constexpr, depth: tl.constexpr,
+    absolute: tl.constexpr, family: tl.constexpr, depth: tl.constexpr, each: tl.constexpr,
 ) -> None:  # fmt: skip
     # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
@@ -230,7 +236,7 @@ def _backward_kernel(
             by_sigma = tl.where(alpha < OPAQUEST, by_sigma, 0.0)
         _add_gradients(
             x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue, weight * near,
-            gaussian, there, gradients, others, absolute, depth,
+            gaussian, there, gradients, others, absolute, depth, each,
         )  # fmt: skip
 
 
@@ -318,12 +324,11 @@ def blend_backward(
         inverse_depths: with `rules.depth`, the result of `blend_family` and the gradient by it.
 
     Returns:
-        Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and (c, n, 1 to 4) by c, the absolute
-        sums of those by x and y if asked for, and that by 1 / depth with `rules.depth`.
+        Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and the others (c, n, OTHERS).
     """
     programs, numbers = launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
     assert len(counts) == programs
-    count, each = records.numel() // RECORD, 1 + 2 * absolute + rules.depth
+    count, each = records.numel() // RECORD, OTHERS[absolute, rules.depth]
     zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     launch(
@@ -331,7 +336,7 @@ def blend_backward(
         records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)), found, others,
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, family=rules.family, depth=rules.depth, num_warps=1, maxnreg=BACKWARD_REGISTERS,
+        absolute=absolute, family=rules.family, depth=rules.depth, each=each, num_warps=1, maxnreg=BACKWARD_REGISTERS,
     )  # fmt: skip
     leading = records.shape[:-1]
     return found.view(*leading, GRADIENT), others.view(*leading, each)

@@ -682,8 +682,8 @@ def _shape_gradient_kernel(
         fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
         of_depth = none
-        if depth:  # the last of the others is by 1 / depth
-            of_inverse = tl.load(others + placed * each + (each - 1))
+        if depth:
+            of_inverse = tl.load(others + placed * each + (each // 2 + 1))
             of_depth = tl.where(visible, -of_inverse * inverse * inverse, 0.0)
         right, under, ahead = _grad_of_mean(
             poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, of_depth,
@@ -772,30 +772,26 @@ def _by_direction(
 
 
 @triton.jit
-def _one_of(sums: tl.tensor, k: tl.tensor, one: tl.constexpr) -> tl.tensor:
-    """Return a row (g,) of sums (k, g), which a thread has all of."""
-    return tl.sum(tl.where(k == one, sums, 0.0), 0)
-
-
-@triton.jit
 def _store_sh(
     by_first: tl.tensor, by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor,
     k: tl.tensor, here: tl.tensor, coefficients: tl.constexpr, apart: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Store red, green and blue (k, g) of each coefficient."""
-    if coefficients % 4 == 0 and not apart:
-        for i in tl.static_range(0, coefficients, 4):
-            into = by_sh + (rows * coefficients + i) * 3
-            r0, g0, b0, r1 = _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), _one_of(red, k, i + 1)
-            g1, b1, r2 = _one_of(green, k, i + 1), _one_of(blue, k, i + 1), _one_of(red, k, i + 2)
-            g2, b2, r3 = _one_of(green, k, i + 2), _one_of(blue, k, i + 2), _one_of(red, k, i + 3)
-            _store_four(into, r0, g0, b0, r1, here)
-            _store_four(into + 4, g1, b1, r2, g2, here)
-            _store_four(into + 8, b2, r3, _one_of(green, k, i + 3), _one_of(blue, k, i + 3), here)
+    """Store red, green and blue (k, g) of each coefficient.
+
+    Threads first exchange numbers, so that those beside each other store a row together: Triton gives the channels, and
+    then the coefficients, to consecutive threads.
+    """
+    channel = tl.arange(0, 4)[None, None, :]
+    values = tl.reshape(
+        tl.join(tl.join(red, blue), tl.join(green, tl.zeros_like(red))), (red.shape[0], red.shape[1], 4)
+    )
+    k, rows = k[:, :, None], rows[None, :, None]
+    wanted = here[None, :, None] & (channel < 3) & (k < coefficients)
+    if apart:
+        tl.store(by_first + 3 * (rows + 0 * k) + channel, values, wanted & (k == 0))
+        tl.store(by_sh + (rows * (coefficients - 1) + k - 1) * 3 + channel, values, wanted & (k > 0))
     else:
-        for i in tl.static_range(coefficients):
-            into = _coefficient(by_first, by_sh, rows, i, coefficients, apart)
-            _store_three(into, _one_of(red, k, i), _one_of(green, k, i), _one_of(blue, k, i), here)
+        tl.store(by_sh + (rows * coefficients + k) * 3 + channel, values, wanted)
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)

@@ -35,8 +35,8 @@ from lapgs_plugin.gpu_raster.walk_kernels import (
 )
 from lapgs_plugin.ops.launch import launch
 
-SUMS = 4
-"""Of weights, of 1, of shares, of distances."""
+SUMS = 5
+"""Of weights, of 1, of shares, of distances; and one without meaning, see `blend_kernels.OTHERS`."""
 OF_SUMS, SQUARES, REMAINDERS = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 """What a launch adds up: `SUMS`, squared gradients, or weights times shares times what is left behind each Gaussian."""
 LAST = tl.constexpr(2**31 - 1)
@@ -98,7 +98,7 @@ def _sum_kernel(
             # In the thread of column i is the i-th sum.
             pair = sum_of_pair(of_weight, of_share, 2)
             total = sum_of_pair(pair, sum_of_pair(of_one, of_distance, 2), 1)
-            tl.atomic_add(sums + 4 * gaussian + lane, total, there, sem="relaxed")
+            tl.atomic_add(sums + 5 * gaussian + lane, total, there, sem="relaxed")
         else:
             if what == SQUARES:
                 shade = red * by_red + green * by_green + blue * by_blue
@@ -130,7 +130,7 @@ def _leader_kernel(
     # Axes as in the backward kernel of blending.
     bucket: tl.constexpr = splats * SPLAT_LANES
     regions: tl.constexpr = (tile // LANES) * (tile // rows)
-    index, _, row, column = place_region(across, tiles, rows, tile)
+    index, image, row, column = place_region(across, tiles, rows, tile)
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
@@ -158,7 +158,7 @@ def _leader_kernel(
         before, after, transmittance = transmittances_of(alpha, transmittance)
         share = tl.where(after > LEAST, alpha * before, 0.0)
         cover += tl.sum(share, 2, keep_dims=True)
-        order = tl.broadcast_to(head + within, share.shape)
+        order = tl.broadcast_to(within, share.shape) + head
         open_ = (share < limit) | ((share == limit) & (order > after_order))
         share = tl.where(open_, share, 0.0)
         largest = tl.max(share, 2, keep_dims=True)
@@ -196,7 +196,7 @@ def _sum(seen: Blended, weights: Tensor, by_image: Tensor, columns: int, what: i
 
 
 def sums_over_pixels(seen: Blended, weights: Tensor) -> Tensor:
-    """Return sums of weights, of 1, of shares and of distances in pixels where each Gaussian is blended, (n, 4).
+    """Return sums of weights, of 1, of shares and of distances in pixels where each Gaussian is blended, (n, SUMS).
 
     Args:
         weights: (h * w,) of the pixels.
