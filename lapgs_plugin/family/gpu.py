@@ -15,20 +15,25 @@ from torch.autograd.function import once_differentiable
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.call import SUMS, Blending, Contributions, Inputs, Options, Output, Settings
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
-from lapgs_plugin.gpu_raster.records import Blended, Parameters, aligned
+from lapgs_plugin.gpu_raster.records import RECORD, TILE, Blended, Parameters, aligned
 from lapgs_plugin.gpu_raster.rules import Numbers, Rules
 from lapgs_plugin.gpu_raster.tiles import blend_family_in_tiles
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
-LONGEST_SIDE = 16 * (2**15 - 1)
+LONGEST_SIDE = TILE * (2**15 - 1)
 """Pixels of an image's side whose tiles can be numbered in 15 bits."""
+MOST_NUMBERS = 2**31 - 1
+"""Numbers of all Gaussians that the kernels can count."""
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     """Render differentiably by all tensors of `inputs`, which fit each other.
 
+    Focal lengths are those of the fields of view; `projmatrix`, which is never read on the processor, says where the
+    principal point is.
+
     Raises:
-        UserInputError: the image is too large for the kernels.
+        UserInputError: the image is too large for the kernels, or there are too many Gaussians.
     """
     call = _Call(settings, inputs, options)
     image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
@@ -60,6 +65,9 @@ class _Call:
         if max(self.size) > LONGEST_SIDE:
             width, height = self.size
             raise UserInputError(f"an image of {width}x{height} pixels: expected {LONGEST_SIDE} a side at most")
+        coefficients = 0 if inputs.sh is None else 3 * (inputs.sh.shape[1] + 1)
+        if (most := MOST_NUMBERS // max(coefficients, RECORD)) < len(inputs.means):
+            raise UserInputError(f"{len(inputs.means)} Gaussians: expected {most} at most with as many coefficients")
         self.rules = Rules(
             family=True,
             covariances=inputs.covariances is not None,

@@ -130,7 +130,8 @@ def _leader_kernel(
     # Axes as in the backward kernel of blending.
     bucket: tl.constexpr = splats * SPLAT_LANES
     regions: tl.constexpr = (tile // LANES) * (tile // rows)
-    index, image, row, column = place_region(across, tiles, rows, tile)
+    region = place_region(across, tiles, rows, tile)
+    index, row, column = region[0], region[2], region[3]
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
