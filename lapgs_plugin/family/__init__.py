@@ -10,7 +10,7 @@ does not. Where there is no GPU, a checkout's `.cuda()` calls have to be redirec
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from types import ModuleType
@@ -25,13 +25,12 @@ from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
 __all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "unavailable"]
 
 
-def stand_ins(variant: str, *, neighbours: bool = False, keep: Collection[str] = ()) -> dict[str, ModuleType]:
+def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType]:
     """Return the modules of a checkout of `variant` by their CUDA names: its rasterizer, simple_knn and fused_ssim.
 
     Args:
         variant: a key of `VARIANTS`.
         neighbours: whether simple_knn is the one that returns neighbours beside their distances.
-        keep: packages to leave out, by name, because the checkout's own are used.
 
     Raises:
         UserInputError: there is no such variant.
@@ -52,7 +51,6 @@ def stand_ins(variant: str, *, neighbours: bool = False, keep: Collection[str] =
         "simple_knn._C": _module("simple_knn._C", {"distCUDA2": knn}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
     }
-    found = {name: module for name, module in found.items() if name.partition(".")[0] not in keep}
     for full, module in found.items():
         parent, _, child = full.rpartition(".")
         if parent:
@@ -82,7 +80,7 @@ def _parents(name: str) -> list[str]:
 
 
 @contextmanager
-def install(variant: str, *, neighbours: bool = False, keep: Collection[str] = ()) -> Iterator[dict[str, ModuleType]]:
+def install(variant: str, *, neighbours: bool = False) -> Iterator[dict[str, ModuleType]]:
     """Let imports of the CUDA modules find the stand-ins inside the block.
 
     Modules that imported them keep them. Arguments are those of `stand_ins`.
@@ -90,7 +88,7 @@ def install(variant: str, *, neighbours: bool = False, keep: Collection[str] = (
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
     """
-    found = stand_ins(variant, neighbours=neighbours, keep=keep)
+    found = stand_ins(variant, neighbours=neighbours)
     taken = sorted(found.keys() & sys.modules.keys())
     if taken:
         raise UserInputError(f"{taken[0]} is already imported; install stand-ins before the checkout's modules")
