@@ -49,7 +49,7 @@ BOUNDS = {
     torch.float64: Bounds(image=1e-12, element=1e-11, row=1e-9, relative_l2=1e-11, mean2d=1e-13),
 }
 """By the rasterizer's float type."""
-RULES = ("three_sigma_cut", "mult", "antialiasing", "blur")
+RULES = ("three_sigma_cut", "mult", "antialiasing", "exact_antialiasing", "blur")
 """Fields of `Semantics` that are options of the oracle."""
 ROW_FLOOR = 1e-3
 ROUNDINGS = 16

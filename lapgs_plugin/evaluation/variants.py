@@ -54,6 +54,7 @@ def _semantics(options: Options, device: str) -> Semantics:
         three_sigma_cut=cut,
         mult=None if options.mult == 1 else options.mult,  # with 1 the ellipses hold all alphas of 1/255
         antialiasing=options.antialiasing,
+        exact_antialiasing=options.exact_antialiasing,
         blur=options.blur,
         expanded_conic_gradient=on_gpu,
         rebuilt_transmittance=on_gpu,

@@ -58,6 +58,8 @@ class Options:
     Attributes:
         mult: FastGS's compact box, or None for three-sigma squares.
         antialiasing: dim Gaussians that are smaller than a pixel.
+        exact_antialiasing: as Mip-Splatting does: those whose determinant without the blur is at most `VANISHING` are
+            left out, and gradients are exact. Else their factor has a lower bound, and graphdeco's gradient.
         blur: variance that is added to the 2D covariances, in px^2.
         inverse_depth: also blend 1 / depth.
         sums: those of `SUMS` to compute.
@@ -67,6 +69,7 @@ class Options:
 
     mult: float | None = None
     antialiasing: bool = False
+    exact_antialiasing: bool = False
     blur: float = PIXEL_VARIANCE
     inverse_depth: bool = False
     sums: tuple[str, ...] = ()

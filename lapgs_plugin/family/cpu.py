@@ -43,7 +43,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
             assert inputs.scales is not None
             assert inputs.quats is not None
             covariances = covariances_of(inputs.scales * settings.scale_modifier, inputs.quats)
-        factors = antialiasing_factors(inputs.means, covariances, view)
+        factors = antialiasing_factors(inputs.means, covariances, view, options.exact_antialiasing)
         inputs = inputs._replace(opacities=inputs.opacities * factors)
     call = _Call(
         settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)

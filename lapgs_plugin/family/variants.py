@@ -225,7 +225,7 @@ FORKS = {
     "mip-splatting": Variant(
         "Stand in for the rasterizer of Mip-Splatting: with antialiasing, of any variance.",
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
-        options=lambda settings: Options(antialiasing=True, blur=settings.kernel_size),
+        options=lambda settings: Options(antialiasing=True, exact_antialiasing=True, blur=settings.kernel_size),
         returned=2,
         binding=forks.MipSplatting,
         unavailable="pixels that are moved by subpixel_offset (--ray_jitter)",

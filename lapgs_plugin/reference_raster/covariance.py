@@ -31,6 +31,7 @@ from lapgs_plugin.reference_raster.layout import (
     SUM_UV,
     SUM_VV,
     TRANSLATION,
+    VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
 from lapgs_plugin.reference_raster.pipeline import Kept, View
@@ -105,14 +106,29 @@ class _Antialiasing(torch.autograd.Function):
                             (w * x + x * x + z * z) * common], 1), None  # fmt: skip
 
 
-def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tensor:
+def antialiasing_factors(means: Tensor, covariances: Tensor, view: View, exact: bool) -> Tensor:
     """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + blur|).
 
     They are computed in float64, because the determinant of a long Gaussian is a small difference of large products.
+
+    Args:
+        means, covariances, view: as `screen_covariances` takes them.
+        exact: as in Mip-Splatting, see `layout.VANISHING`; else with graphdeco's lower bound and gradient.
     """
     on_screen = screen_covariances(means.double(), covariances.double(), view)
-    factors: Tensor = _Antialiasing.apply(on_screen, float(view.camera[BLUR]))  # type: ignore[no-untyped-call]  # torch's
+    blur = float(view.camera[BLUR])
+    factors: Tensor = (
+        _exact_factors(on_screen, blur) if exact else _Antialiasing.apply(on_screen, blur)  # type: ignore[no-untyped-call]  # torch's
+    )
     return factors[:, None].to(means.dtype)
+
+
+def _exact_factors(covariances: Tensor, blur: float) -> Tensor:
+    xx, xy, yy = covariances.unbind(1)
+    own, wide = xx * yy - xy * xy, (xx + blur) * (yy + blur) - xy * xy
+    shown = own > VANISHING
+    share = torch.where(shown, own, 1.0) / (wide + VANISHING)
+    return torch.where(shown, (share + VANISHING).sqrt(), 0.0)
 
 
 def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, slots: Floats) -> Tensor:

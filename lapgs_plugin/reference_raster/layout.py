@@ -22,6 +22,11 @@ PIXEL_VARIANCE = 0.3
 than about a pixel."""
 MIN_SHARE = 2.5e-5
 """Lower bound, in antialiasing, of the determinant without the blur over that with it."""
+VANISHING = 1e-6
+"""Largest determinant without the blur, in px^4, of Gaussians that Mip-Splatting's antialiasing leaves out.
+
+It also adds as much to the determinant with the blur, and to the quotient of both.
+"""
 JACOBIAN_LIMIT = 1.3
 """The Jacobian is taken at most this many half image sides away from the optical axis."""
 RADIUS_SIGMAS = 3.0

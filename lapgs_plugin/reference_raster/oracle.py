@@ -43,6 +43,7 @@ from lapgs_plugin.reference_raster.layout import (
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
+    VANISHING,
 )
 
 
@@ -95,7 +96,8 @@ class OracleRasterizer(Rasterizer):
             front of the camera is then in every tile and has a radius.
         mult: instead of that cut, blend a Gaussian in the tiles that the ellipse of `mult` times the squared distance
             meets at which alpha reaches 1/255 (FastGS).
-        antialiasing: multiply opacities by sqrt(|Sigma| / |Sigma + blur|).
+        antialiasing: multiply opacities by sqrt(|Sigma| / |Sigma + blur|), at least by 0.005.
+        exact_antialiasing: do that as Mip-Splatting: leave out what is smaller than `layout.VANISHING`.
         blur: variance added to 2D covariances, in px^2.
     """
 
@@ -108,10 +110,11 @@ class OracleRasterizer(Rasterizer):
         three_sigma_cut: bool = True,
         mult: float | None = None,
         antialiasing: bool = False,
+        exact_antialiasing: bool = False,
         blur: float = PIXEL_VARIANCE,
     ) -> None:
         self._three_sigma_cut = three_sigma_cut and mult is None
-        self._mult, self._antialiasing, self._blur = mult, antialiasing, blur
+        self._mult, self._antialiasing, self._exact, self._blur = mult, antialiasing, exact_antialiasing, blur
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
@@ -130,7 +133,7 @@ class OracleRasterizer(Rasterizer):
         seen = project(field, camera, three_sigma_cut=self._three_sigma_cut, blur=self._blur)
         opacities = torch.sigmoid(field.opacity_logits[seen.ids])  # (v,)
         if self._antialiasing:
-            opacities = opacities * antialiasing_factors(seen, self._blur)
+            opacities = opacities * antialiasing_factors(seen, self._blur, self._exact)
         ellipses = None if self._mult is None else Ellipses(seen.means2d, seen.conics, reaches(opacities, self._mult))
         lists = tile_lists(seen.depths, seen.rectangles, camera, ellipses)
         if ellipses is not None:
@@ -264,16 +267,21 @@ def inverse_covariances(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor
     return torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]
 
 
-def antialiasing_factors(seen: Projection, blur: float) -> Tensor:
-    """Return the factors (v,) of antialiasing on opacities."""
+def antialiasing_factors(seen: Projection, blur: float, exact: bool) -> Tensor:
+    """Return the factors (v,) of antialiasing on opacities; see `OracleRasterizer`."""
     xx, xy, yy = (seen.conics[:, i] * seen.determinants * sign for i, sign in ((2, 1), (1, -1), (0, 1)))
 
     def share(xx: Tensor, yy: Tensor) -> Tensor:
         return (xx * yy - xy * xy) / ((xx + blur) * (yy + blur) - xy * xy)
 
+    if exact:
+        own = (xx - blur) * (yy - blur) - xy * xy  # (v,)
+        shown = own > VANISHING  # (v,)
+        share_of_shown = own.where(shown, 1.0) / (seen.determinants + VANISHING)  # (v,)
+        return torch.where(shown, (share_of_shown + VANISHING).sqrt(), 0.0)
     # DEPARTURE: the CUDA code differentiates the share at covariances that already have the blur.
-    exact, shifted = share(xx - blur, yy - blur), share(xx, yy)  # (v,) each
-    return (exact.detach() + shifted - shifted.detach()).clamp(min=MIN_SHARE).sqrt()
+    true, shifted = share(xx - blur, yy - blur), share(xx, yy)  # (v,) each
+    return (true.detach() + shifted - shifted.detach()).clamp(min=MIN_SHARE).sqrt()
 
 
 def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ Gradients mix pixels. Compare those of a loss whose weights vanish on the masked
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,6 +45,7 @@ from lapgs_plugin.reference_raster.layout import (
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
+    VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import (
     Ellipses,
@@ -116,6 +117,7 @@ def threshold_mask(
     three_sigma_cut: bool = True,
     mult: float | None = None,
     antialiasing: bool = False,
+    exact_antialiasing: bool = False,
     blur: float = PIXEL_VARIANCE,
 ) -> ThresholdMask:
     """Find the pixels and Gaussians whose rendering depends on rounding.
@@ -125,13 +127,15 @@ def threshold_mask(
         camera: the view.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
-        three_sigma_cut, mult, antialiasing, blur: as in `OracleRasterizer`.
+        three_sigma_cut, mult, antialiasing, exact_antialiasing, blur: as in `OracleRasterizer`.
     """
     if tolerance is None:
         tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
     field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
     degree = degree_to_evaluate(field, sh_degree)
-    bounded = _project(field, camera, degree, tolerance, three_sigma_cut and mult is None, antialiasing, blur)
+    bounded = _project(field, camera, degree, tolerance, three_sigma_cut and mult is None, blur)
+    if antialiasing:
+        bounded = (_dimmed_exactly if exact_antialiasing else _dimmed)(bounded)
     ellipses = None if mult is None else _ellipses(bounded, mult, tolerance)
     radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
     radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
@@ -146,7 +150,6 @@ def _project(
     degree: int,
     tolerance: float,
     three_sigma_cut: bool,
-    antialiasing: bool,
     blur: float,
 ) -> _Bounded:
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
@@ -176,11 +179,6 @@ def _project(
     # If the rotation only picks a coordinate, the depth is one exactly rounded sum: the same bits everywhere.
     axis_aligned = bool((rotation[2].abs() == 1).any())
     logits = field.opacity_logits[ids]  # (v,)
-    opacities, opacity_errors = torch.sigmoid(logits), tolerance * (1 + logits.abs())  # (v,) each
-    if antialiasing:
-        opacities = opacities * shapes.shares.clamp(min=MIN_SHARE).sqrt()
-        opacity_errors = opacity_errors + shapes.share_errors / shapes.shares.clamp(min=MIN_SHARE) / 2
-        kinks |= touched & ((shapes.shares - MIN_SHARE).abs() <= shapes.share_errors)
     return _Bounded(
         ids=ids,
         means=field.means[ids],
@@ -189,8 +187,8 @@ def _project(
         means2d=means2d,
         mean_errors=mean_errors,
         shapes=shapes,
-        opacities=opacities,
-        opacity_errors=opacity_errors,
+        opacities=torch.sigmoid(logits),
+        opacity_errors=tolerance * (1 + logits.abs()),
         surely=surely,
         possibly=possibly,
         open_radii=open_radii,
@@ -207,7 +205,8 @@ class _Shapes:
         conic_errors: (v,) relative error of the quadratic form with this conic.
         smallest_radii, largest_radii: (v,) whole pixels.
         degenerate: (v,) True where the determinant may round to 0 or below.
-        shares, share_errors: (v,) the determinant without the blur over that with it.
+        own, own_errors: (v,) the determinants without the blur.
+        shares, share_errors: (v,) these over the determinants with it.
     """
 
     conics: Tensor
@@ -215,6 +214,8 @@ class _Shapes:
     smallest_radii: Tensor
     largest_radii: Tensor
     degenerate: Tensor
+    own: Tensor
+    own_errors: Tensor
     shares: Tensor
     share_errors: Tensor
 
@@ -257,8 +258,36 @@ def _shapes(
         smallest_radii=torch.ceil(radii - radius_errors).clamp(max=MAX_RADIUS),
         largest_radii=torch.ceil(radii + radius_errors).clamp(max=MAX_RADIUS),
         degenerate=determinants.abs() <= determinant_errors + 4 * middle * errors,
+        own=own,
+        own_errors=own_errors,
         shares=shares,
         share_errors=own_errors / determinants.abs() + shares.abs() * conic_errors,
+    )
+
+
+def _dimmed(bounded: _Bounded) -> _Bounded:
+    """Dim the opacities by antialiasing with its lower bound."""
+    shapes = bounded.shapes
+    shares = shapes.shares.clamp(min=MIN_SHARE)  # (v,)
+    return replace(
+        bounded,
+        opacities=bounded.opacities * shares.sqrt(),
+        opacity_errors=bounded.opacity_errors + shapes.share_errors / shares / 2,
+        kinks=bounded.kinks | ((shapes.shares - MIN_SHARE).abs() <= shapes.share_errors),
+    )
+
+
+def _dimmed_exactly(bounded: _Bounded) -> _Bounded:
+    """Dim the opacities by antialiasing as Mip-Splatting does."""
+    shapes = bounded.shapes
+    shown, is_open = shapes.own > VANISHING, (shapes.own - VANISHING).abs() <= shapes.own_errors  # (v,) each
+    shares = shapes.shares.clamp(min=0) + VANISHING  # (v,)
+    errors = bounded.opacity_errors + shapes.share_errors / shares / 2  # (v,)
+    return replace(
+        bounded,
+        opacities=bounded.opacities * torch.where(shown | is_open, shares.sqrt(), 0),
+        opacity_errors=torch.where(is_open, errors.clamp(min=1), errors),
+        kinks=bounded.kinks | is_open,
     )
 
 

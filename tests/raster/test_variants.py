@@ -27,21 +27,27 @@ def test_a_variant_renders_by_its_own_rules(name: str) -> None:
 
 
 def test_variants_are_checked_with_each_option_that_changes_an_image() -> None:
-    kinds = {(s.semantics.mult, s.semantics.antialiasing, s.semantics.blur) for s in SUBJECTS.values()}
-    assert kinds == {(None, False, 0.3), (0.5, False, 0.3), (None, True, 0.3), (None, True, 0.1)}
+    rules = "mult", "antialiasing", "exact_antialiasing", "blur"
+    kinds = {tuple(getattr(subject.semantics, name) for name in rules) for subject in SUBJECTS.values()}
+    assert kinds == {
+        (None, False, False, 0.3),
+        (0.5, False, False, 0.3),
+        (None, True, False, 0.3),
+        (None, True, True, 0.1),
+    }
     left_out = {name for name in VARIANTS if not any(label.split(",")[0] == name for label in SUBJECTS)}
     assert left_out == {"2dgs", "faster-gs"}, "one renders no Gaussians, the other has no class"
 
 
-@pytest.mark.parametrize("rule", [{"mult": 0.8}, {"antialiasing": False}, {"blur": 0.3}])
+@pytest.mark.parametrize("rule", [{"mult": 0.8}, {"antialiasing": False}, {"exact_antialiasing": False}, {"blur": 0.3}])
 def test_other_rules_fail(rule: dict[str, float]) -> None:
-    """Each rule changes an image enough to be seen."""
+    """Each rule changes an image or a gradient enough to be seen."""
     (changed,) = rule
     subject = next(
         subject for subject in SUBJECTS.values() if getattr(subject.semantics, changed) not in (None, False, 0.3)
     )
     wrong = replace(subject, semantics=replace(subject.semantics, **rule))
-    assert any("image is off" in line for line in problems(wrong, ("degree_2_coloured", "specks", "crowd")))
+    assert any("is off" in line for line in problems(wrong, ("degree_2_coloured", "specks", "crowd")))
 
 
 @pytest.mark.slow
