@@ -99,15 +99,14 @@ class Contributions:
 
 
 class Blending(ABC):
-    """Say how n Gaussians are blended in each pixel of an image, without gradients.
-
-    Attributes:
-        n: number of Gaussians.
-        transmittance: (height, width) behind all Gaussians.
-    """
+    """Say how `n` Gaussians are blended in each pixel of an image, without gradients."""
 
     n: int
-    transmittance: Tensor
+
+    @property
+    @abstractmethod
+    def transmittance(self) -> Tensor:
+        """Return the transmittance (height, width) behind all Gaussians."""
 
     @abstractmethod
     def leaders(self, ranks: int = 1) -> Tensor:

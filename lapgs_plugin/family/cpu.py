@@ -135,8 +135,11 @@ class _Blending(Blending):
     """Answer in tensors what `TiledBlending` computes in NumPy."""
 
     def __init__(self, tiled: TiledBlending) -> None:
-        self._tiled = tiled
-        self.n, self.transmittance = tiled.n, torch.from_numpy(tiled.rendering.transmittance)
+        self._tiled, self.n = tiled, tiled.n
+
+    @property
+    def transmittance(self) -> Tensor:
+        return torch.from_numpy(self._tiled.rendering.transmittance)
 
     def leaders(self, ranks: int = 1) -> Tensor:
         return torch.from_numpy(self._tiled.leaders(ranks))

@@ -73,6 +73,7 @@ class _Call:
             covariances=inputs.covariances is not None,
             apart=inputs.dc is not None,
             dimmed=options.antialiasing,
+            exact=options.exact_antialiasing,
             snug=options.mult is not None,
             depth=options.inverse_depth,
         )
@@ -208,7 +209,7 @@ class _Blending(Blending):
         self.n = 0 if self._seen is None else self._seen.records.shape[1]
 
     @cached_property
-    def transmittance(self) -> Tensor:  # type: ignore[override]  # made when it is asked for
+    def transmittance(self) -> Tensor:
         width, height = self._size
         if self._seen is None:
             return self._like.new_ones(height, width)

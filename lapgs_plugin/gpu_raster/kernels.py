@@ -24,8 +24,10 @@ from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_RADIUS,
     MIN_ROOT,
+    MIN_SHARE,
     NEAR_DEPTH,
     RADIUS_SIGMAS,
+    VANISHING,
 )
 
 BLOCK = 128
@@ -38,8 +40,8 @@ BEYOND = tl.constexpr(0.3)
 CENTRED, SIGMAS, LEAST_ROOT = tl.constexpr(JACOBIAN_LIMIT), tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
 """The family's: the Jacobian's limit in half images from the centre, and numbers of its three-sigma radius."""
 LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
-LEAST_SHARE = tl.constexpr(2.5e-5)
-"""Lower bound, where Gaussians are dimmed, of the determinant without the blur over that with it."""
+LEAST_SHARE, LEAST_AREA = tl.constexpr(MIN_SHARE), tl.constexpr(VANISHING)
+"""Where Gaussians are dimmed: lower bounds of the determinant without the blur over that with it, and of the first."""
 
 # Kernels are only compiled anew for another number of coefficients: the active degree grows during a stage, and bases
 # and residuals alternate.
@@ -431,13 +433,19 @@ def _footprint(
 
 
 @triton.jit
-def _dimming(wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor) -> tl.tensor:
+def _dimming(
+    wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor, exact: tl.constexpr
+) -> tl.tensor:  # fmt: skip
     """Return the factors on opacities of antialiasing, and the shares that they are the roots of.
 
     Of the arguments `area` alone has the blur.
     """
-    share = (wide * high - skew * skew) / area
-    return tl.sqrt(tl.maximum(share, LEAST_SHARE)), share
+    own = wide * high - skew * skew
+    share = own / area
+    factor = tl.sqrt(tl.maximum(share, LEAST_SHARE))
+    if exact:
+        factor = tl.where(own > LEAST_AREA, tl.sqrt(tl.abs(own / (area + LEAST_AREA)) + LEAST_AREA), 0.0)
+    return factor, share
 
 
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
@@ -450,7 +458,7 @@ def _project_kernel(
     modifier: float, blur: float, mult: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
     tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    snug: tl.constexpr,
+    exact: tl.constexpr, snug: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -478,7 +486,7 @@ def _project_kernel(
         area = wide * high - skew * skew
         effective = opacity
         if dimmed:
-            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area)[0]
+            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area, exact)[0]
         if family:
             in_columns, in_rows, radius, seen = _footprint(
                 pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective, here & (depth > NEAR),
@@ -606,11 +614,19 @@ def _store_shape_gradients(
 @triton.jit
 def _dimming_backward(
     sharp_wide: tl.tensor, skew: tl.tensor, sharp_high: tl.tensor, blur: float, of_factor: tl.tensor,
-    visible: tl.tensor,
+    visible: tl.tensor, exact: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return the factors on opacities, and what they add to the gradients by xx, by xy and yx each, and by yy."""
     wide, high = sharp_wide + blur, sharp_high + blur
-    factor, share = _dimming(sharp_wide, skew, sharp_high, wide * high - skew * skew)
+    area = wide * high - skew * skew
+    factor, share = _dimming(sharp_wide, skew, sharp_high, area, exact)
+    if exact:
+        of_own = tl.where(visible & (factor > 0.0), of_factor / (2.0 * factor * (area + LEAST_AREA)), 0.0)
+        of_area = -of_own * (sharp_wide * sharp_high - skew * skew) / (area + LEAST_AREA)
+        return (
+            factor, of_own * sharp_high + of_area * high, -skew * (of_own + of_area),
+            of_own * sharp_wide + of_area * wide,
+        )  # fmt: skip
     of_share = tl.where(visible & (share > LEAST_SHARE), of_factor / (2.0 * factor), 0.0)
     # The CUDA code differentiates the share at covariances that already have the blur, and not at those that it is
     # computed from.
@@ -631,7 +647,7 @@ def _shape_gradient_kernel(
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
     record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
-    dimmed: tl.constexpr, depth: tl.constexpr,
+    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -665,7 +681,7 @@ def _shape_gradient_kernel(
             cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
             of_yy = qx * cov_x + qy * cov_y + qz * cov_z
             factor, of_xx, of_xy, of_yy = _dimming_backward(
-                of_xx, of_xy, of_yy, blur, of_opacity * tl.load(opacities + row), visible
+                of_xx, of_xy, of_yy, blur, of_opacity * tl.load(opacities + row), visible, exact
             )
             wide, skew, high = wide + of_xx, skew + of_xy, high + of_yy
             of_opacity = tl.where(visible, of_opacity * factor, 0.0)
@@ -943,7 +959,8 @@ def _project(
         *given, given.sh if first is None else first, *cameras[:3], *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
         coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
-        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed, snug=rules.snug,
+        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
+        exact=rules.exact, snug=rules.snug,
     )  # fmt: skip
 
 
@@ -998,7 +1015,7 @@ def _project_backward(
         cameras.width, cameras.height, n, count, *numbers[:2],
         record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
-        dimmed=rules.dimmed, depth=rules.depth,
+        dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth,
     )  # fmt: skip
     if coefficients == 0:
         return

@@ -19,6 +19,7 @@ class Rules(NamedTuple):
         covariances: Gaussians are given by covariances (n, 6) in the place of standard deviations.
         apart: the first SH coefficient is apart from the others.
         dimmed: Gaussians that are smaller than a pixel are dimmed, as the family's antialiasing does.
+        exact: they are dimmed as Mip-Splatting does, see `layout.VANISHING`.
         snug: a footprint is the tiles that an ellipse meets instead of those that a square of three sigma does.
         depth: 1 / depth is blended, too, over 0.
     """
@@ -27,6 +28,7 @@ class Rules(NamedTuple):
     covariances: bool = False
     apart: bool = False
     dimmed: bool = False
+    exact: bool = False
     snug: bool = False
     depth: bool = False
 
