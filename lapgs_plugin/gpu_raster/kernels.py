@@ -16,18 +16,24 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.memory_kernels import load_four, load_three, store_four, store_three
 from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, GRADIENT, RECORD, TILE, Parameters, Projected
 from lapgs_plugin.gpu_raster.rules import GSPLAT, NUMBERS, Numbers, Rules
-from lapgs_plugin.gpu_raster.walk_kernels import FAINTEST, INTERPRETED, load_four, meets
+from lapgs_plugin.gpu_raster.sh_kernels import (
+    NOT_SPECIALIZED,
+    color_gradient_kernel,
+    color_of,
+    direction_to,
+    is_visible,
+)
+from lapgs_plugin.gpu_raster.walk_kernels import FAINTEST, meets
 from lapgs_plugin.ops.launch import blocks, launch
 from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_RADIUS,
     MIN_ROOT,
-    MIN_SHARE,
     NEAR_DEPTH,
     RADIUS_SIGMAS,
-    VANISHING,
 )
 
 BLOCK = 128
@@ -40,151 +46,8 @@ BEYOND = tl.constexpr(0.3)
 CENTRED, SIGMAS, LEAST_ROOT = tl.constexpr(JACOBIAN_LIMIT), tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
 """The family's: the Jacobian's limit in half images from the centre, and numbers of its three-sigma radius."""
 LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
-LEAST_SHARE, LEAST_AREA = tl.constexpr(MIN_SHARE), tl.constexpr(VANISHING)
-"""Where Gaussians are dimmed: lower bounds of the determinant without the blur over that with it, and of the first."""
-
-# Kernels are only compiled anew for another number of coefficients: the active degree grows during a stage, and bases
-# and residuals alternate.
-NOT_SPECIALIZED = ("n", "cameras", "active", "signed")
-
-
-@triton.jit
-def _basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911, PLR0912  # a return for each k, of which Triton compiles one
-    """Return the k-th real spherical harmonic of a unit direction, in the order and with the signs of 3DGS."""
-    xx, yy, zz = x * x, y * y, z * z
-    if k == 0:
-        return 0.28209479177387814 + 0.0 * x
-    if k == 1:
-        return -0.4886025119029199 * y
-    if k == 2:
-        return 0.4886025119029199 * z
-    if k == 3:
-        return -0.4886025119029199 * x
-    if k == 4:
-        return 1.0925484305920792 * x * y
-    if k == 5:
-        return -1.0925484305920792 * y * z
-    if k == 6:
-        return 0.31539156525252005 * (2.0 * zz - xx - yy)
-    if k == 7:
-        return -1.0925484305920792 * x * z
-    if k == 8:
-        return 0.5462742152960396 * (xx - yy)
-    if k == 9:
-        return -0.5900435899266435 * y * (3.0 * xx - yy)
-    if k == 10:
-        return 2.890611442640554 * x * y * z
-    if k == 11:
-        return -0.4570457994644658 * y * (4.0 * zz - xx - yy)
-    if k == 12:
-        return 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-    if k == 13:
-        return -0.4570457994644658 * x * (4.0 * zz - xx - yy)
-    if k == 14:
-        return 1.445305721320277 * z * (xx - yy)
-    return -0.5900435899266435 * x * (xx - 3.0 * yy)
-
-
-@triton.jit
-def _basis_x(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """Return the derivative of `_basis` by x."""
-    xx, yy, zz = x * x, y * y, z * z
-    if k == 3:
-        return -0.4886025119029199 + 0.0 * x
-    if k == 4:
-        return 1.0925484305920792 * y
-    if k == 6:
-        return -2.0 * 0.31539156525252005 * x
-    if k == 7:
-        return -1.0925484305920792 * z
-    if k == 8:
-        return 2.0 * 0.5462742152960396 * x
-    if k == 9:
-        return -6.0 * 0.5900435899266435 * x * y
-    if k == 10:
-        return 2.890611442640554 * y * z
-    if k == 11:
-        return 2.0 * 0.4570457994644658 * x * y
-    if k == 12:
-        return -6.0 * 0.3731763325901154 * x * z
-    if k == 13:
-        return -0.4570457994644658 * (4.0 * zz - 3.0 * xx - yy)
-    if k == 14:
-        return 2.0 * 1.445305721320277 * x * z
-    if k == 15:
-        return -3.0 * 0.5900435899266435 * (xx - yy)
-    return 0.0 * x
-
-
-@triton.jit
-def _basis_y(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """Return the derivative of `_basis` by y."""
-    xx, yy, zz = x * x, y * y, z * z
-    if k == 1:
-        return -0.4886025119029199 + 0.0 * x
-    if k == 4:
-        return 1.0925484305920792 * x
-    if k == 5:
-        return -1.0925484305920792 * z
-    if k == 6:
-        return -2.0 * 0.31539156525252005 * y
-    if k == 8:
-        return -2.0 * 0.5462742152960396 * y
-    if k == 9:
-        return -3.0 * 0.5900435899266435 * (xx - yy)
-    if k == 10:
-        return 2.890611442640554 * x * z
-    if k == 11:
-        return -0.4570457994644658 * (4.0 * zz - xx - 3.0 * yy)
-    if k == 12:
-        return -6.0 * 0.3731763325901154 * y * z
-    if k == 13:
-        return 2.0 * 0.4570457994644658 * x * y
-    if k == 14:
-        return -2.0 * 1.445305721320277 * y * z
-    if k == 15:
-        return 6.0 * 0.5900435899266435 * x * y
-    return 0.0 * x
-
-
-@triton.jit
-def _basis_z(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tensor:  # noqa: PLR0911  # a return for each k, of which Triton compiles one
-    """Return the derivative of `_basis` by z."""
-    xx, yy, zz = x * x, y * y, z * z
-    if k == 2:
-        return 0.4886025119029199 + 0.0 * x
-    if k == 5:
-        return -1.0925484305920792 * y
-    if k == 6:
-        return 4.0 * 0.31539156525252005 * z
-    if k == 7:
-        return -1.0925484305920792 * x
-    if k == 10:
-        return 2.890611442640554 * x * y
-    if k == 11:
-        return -8.0 * 0.4570457994644658 * y * z
-    if k == 12:
-        return 0.3731763325901154 * (6.0 * zz - 3.0 * xx - 3.0 * yy)
-    if k == 13:
-        return -8.0 * 0.4570457994644658 * x * z
-    if k == 14:
-        return 1.445305721320277 * (xx - yy)
-    return 0.0 * x
-
-
-@triton.jit
-def _store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, wanted: tl.tensor) -> None:
-    """Store four numbers from a multiple of 16 bytes on where wanted; where compiled, in one instruction."""
-    if INTERPRETED:
-        tl.store(start, a, wanted)
-        tl.store(start + 1, b, wanted)
-        tl.store(start + 2, c, wanted)
-        tl.store(start + 3, d, wanted)
-    else:
-        tl.inline_asm_elementwise(
-            "{ .reg .pred p; setp.ne.b32 p, $6, 0; @p st.global.v4.f32 [$1], {$2, $3, $4, $5}; mov.b32 $0, 0; }",
-            "=r,l,f,f,f,f,r", [start.to(tl.int64), a, b, c, d, wanted.to(tl.int32)], tl.int32, False, 1,
-        )  # fmt: skip
+LEAST_SHARE = tl.constexpr(2.5e-5)
+"""Lower bound, where Gaussians are dimmed, of the determinant without the blur over that with it."""
 
 
 @triton.jit
@@ -203,18 +66,6 @@ def _rotation(w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor) -> tl.tens
         2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
         2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
     )  # fmt: skip
-
-
-@triton.jit
-def _load_three(start: tl.tensor) -> tl.tensor:
-    return tl.load(start), tl.load(start + 1), tl.load(start + 2)
-
-
-@triton.jit
-def _store_three(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, wanted: tl.tensor) -> None:
-    tl.store(start, a, wanted)
-    tl.store(start + 1, b, wanted)
-    tl.store(start + 2, c, wanted)
 
 
 @triton.jit
@@ -239,11 +90,11 @@ def _shape(
     Given covariances have no quaternions and scales, which are 0.
     """
     if covariances:
-        xx, xy, xz = _load_three(scales + 6 * row)
-        yy, yz, zz = _load_three(scales + 6 * row + 3)
+        xx, xy, xz = load_three(scales + 6 * row)
+        yy, yz, zz = load_three(scales + 6 * row + 3)
         none = 0.0 * xx
         return none, none, none, none, none, none, none, none, xx, xy, xz, yy, yz, zz
-    s0, s1, s2 = _load_three(scales + 3 * row)
+    s0, s1, s2 = load_three(scales + 3 * row)
     if family:
         w, x, y, z = load_four(quaternions + 4 * row)
         length = 0.0 * w + 1.0
@@ -254,20 +105,6 @@ def _shape(
     a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
     xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
     return w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz
-
-
-@triton.jit
-def _is_visible(radii: tl.tensor, placed: tl.tensor) -> tl.tensor:
-    return (tl.load(radii + 2 * placed) > 0) & (tl.load(radii + 2 * placed + 1) > 0)
-
-
-@triton.jit
-def _direction(centre: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, visible: tl.tensor) -> tl.tensor:
-    """Return unit directions from a camera's centre to visible means, and one over their distances."""
-    centre_x, centre_y, centre_z = _load_three(centre)
-    x, y, z = x - centre_x, y - centre_y, z - centre_z
-    near = 1.0 / tl.sqrt(tl.where(visible, x * x + y * y + z * z, 1.0))
-    return x * near, y * near, z * near, near
 
 
 @triton.jit
@@ -326,58 +163,28 @@ def _times(
 
 
 @triton.jit
-def _coefficient(
-    first: tl.tensor, sh: tl.tensor, row: tl.tensor, k: tl.constexpr, coefficients: tl.constexpr, apart: tl.constexpr
-) -> tl.tensor:
-    """Return where the k-th coefficient of each row is in memory: in `first` (n, 1, 3), if that is apart, or `sh`."""
-    if apart:
-        return first + 3 * row if k == 0 else sh + row * (3 * (coefficients - 1)) + 3 * (k - 1)
-    return sh + row * (3 * coefficients) + 3 * k
-
-
-@triton.jit
-def _color(
-    first: tl.tensor, sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
-    coefficients: tl.constexpr, apart: tl.constexpr,
+def _on_screen(
+    xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor,
+    px: tl.tensor, py: tl.tensor, pz: tl.tensor, qx: tl.tensor, qy: tl.tensor, qz: tl.tensor,
 ) -> tl.tensor:  # fmt: skip
-    """Return red, green and blue of rows seen in unit directions, by the first `active` coefficients.
-
-    Without coefficients `sh` (n, 3) are the colours.
-    """
-    if coefficients == 0:
-        return _load_three(sh + 3 * row)
-    start = sh + row * (3 * coefficients)
-    red, green, blue = 0.0 * x, 0.0 * x, 0.0 * x
-    if coefficients % 4 == 0 and not apart:  # then rows begin at multiples of 16 bytes
-        for k in tl.static_range(0, coefficients, 4):
-            if k < active:  # coefficients that are not in use are 0 or wait for their degree
-                r0, g0, b0, r1 = load_four(start + 3 * k)
-                g1, b1, r2, g2 = load_four(start + 3 * k + 4)
-                b2, r3, g3, b3 = load_four(start + 3 * k + 8)
-                f0, f1 = _used_basis(k, x, y, z, active), _used_basis(k + 1, x, y, z, active)
-                f2, f3 = _used_basis(k + 2, x, y, z, active), _used_basis(k + 3, x, y, z, active)
-                red += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
-                green += f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
-                blue += f0 * b0 + f1 * b1 + f2 * b2 + f3 * b3
-    else:
-        for k in tl.static_range(coefficients):
-            factor = _used_basis(k, x, y, z, active)
-            r0, g0, b0 = _load_three(_coefficient(first, sh, row, k, coefficients, apart))
-            red += factor * r0
-            green += factor * g0
-            blue += factor * b0
-    return red, green, blue
+    """Return xx, xy and yy of a covariance in pixels, from that in the world and the projection's rows; no blur."""
+    ux, uy, uz = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
+    vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
+    return px * ux + py * uy + pz * uz, qx * ux + qy * uy + qz * uz, qx * vx + qy * vy + qz * vz
 
 
 @triton.jit
-def _is_used(k: tl.constexpr, active: int) -> tl.tensor:
-    return tl.full((1,), k, tl.int32) < active  # as a block: a number in a mask cannot be interpreted
-
-
-@triton.jit
-def _used_basis(k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int) -> tl.tensor:
-    """Return the k-th spherical harmonic, 0 if it is not active."""
-    return tl.where(_is_used(k, active), _basis(k, x, y, z), 0.0)
+def _half_sides(
+    x: tl.tensor, y: tl.tensor, wide: tl.tensor, high: tl.tensor, area: tl.tensor, opacity: tl.tensor,
+    in_front: tl.tensor, width: int, height: int,
+) -> tl.tensor:  # fmt: skip
+    """Return half a footprint's width and height in whole pixels, as gsplat has it, and where it is in the image."""
+    reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
+    across, down = tl.ceil(reach * tl.sqrt(wide)), tl.ceil(reach * tl.sqrt(high))
+    visible = in_front & (area > 0.0) & (opacity >= FAINTEST) & (across > 0.0) & (down > 0.0)
+    visible = visible & (x + across > 0.0) & (x - across < width)
+    visible = visible & (y + down > 0.0) & (y - down < height)
+    return tl.where(visible, across, 0.0).to(tl.int32), tl.where(visible, down, 0.0).to(tl.int32), visible
 
 
 @triton.jit
@@ -433,19 +240,13 @@ def _footprint(
 
 
 @triton.jit
-def _dimming(
-    wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor, exact: tl.constexpr
-) -> tl.tensor:  # fmt: skip
+def _dimming(wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor) -> tl.tensor:
     """Return the factors on opacities of antialiasing, and the shares that they are the roots of.
 
     Of the arguments `area` alone has the blur.
     """
-    own = wide * high - skew * skew
-    share = own / area
-    factor = tl.sqrt(tl.maximum(share, LEAST_SHARE))
-    if exact:
-        factor = tl.where(own > LEAST_AREA, tl.sqrt(tl.abs(own / (area + LEAST_AREA)) + LEAST_AREA), 0.0)
-    return factor, share
+    share = (wide * high - skew * skew) / area
+    return tl.sqrt(tl.maximum(share, LEAST_SHARE)), share
 
 
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
@@ -458,16 +259,15 @@ def _project_kernel(
     modifier: float, blur: float, mult: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
     tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    exact: tl.constexpr, snug: tl.constexpr,
+    snug: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
-    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
+    mean_x, mean_y, mean_z = load_three(means + 3 * row)
     _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(quaternions, scales, row, modifier, family, covariances)
     opacity = tl.load(opacities + row)
     if not family:
         opacity = 1.0 / (1.0 + tl.exp(-opacity))
-        reach = tl.minimum(REACH, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
     camera, placed = first, start + rows
     while camera < first + cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         u, v, _, _, near, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
@@ -477,16 +277,12 @@ def _project_kernel(
         pixel_x = tl.load(matrix) * u + tl.load(matrix + 2)
         pixel_y = tl.load(matrix + 4) * v + tl.load(matrix + 5)
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, by_x, x_by_z, by_y, y_by_z)
-        cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
-        sharp_wide = px * cov_x + py * cov_y + pz * cov_z
-        skew = qx * cov_x + qy * cov_y + qz * cov_z
-        cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
-        sharp_high = qx * cov_x + qy * cov_y + qz * cov_z
+        sharp_wide, skew, sharp_high = _on_screen(xx, xy, xz, yy, yz, zz, px, py, pz, qx, qy, qz)
         wide, high = sharp_wide + blur, sharp_high + blur
         area = wide * high - skew * skew
         effective = opacity
         if dimmed:
-            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area, exact)[0]
+            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area)[0]
         if family:
             in_columns, in_rows, radius, seen = _footprint(
                 pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective, here & (depth > NEAR),
@@ -497,11 +293,9 @@ def _project_kernel(
             tl.store(radii + 2 * placed + 1, in_rows, here)
             tl.store(depths + placed, tl.where(seen, depth, 0.0), here)
         else:
-            across, down = tl.ceil(reach * tl.sqrt(wide)), tl.ceil(reach * tl.sqrt(high))
-            visible = here & (depth >= NEAR) & (area > 0.0) & (opacity >= FAINTEST) & (across > 0.0) & (down > 0.0)
-            visible = visible & (pixel_x + across > 0.0) & (pixel_x - across < width)
-            visible = visible & (pixel_y + down > 0.0) & (pixel_y - down < height)
-            across, down = tl.where(visible, across, 0.0).to(tl.int32), tl.where(visible, down, 0.0).to(tl.int32)
+            across, down, visible = _half_sides(
+                pixel_x, pixel_y, wide, high, area, opacity, here & (depth >= NEAR), width, height
+            )
             seen, radius = visible, tl.maximum(across, down)
             tl.store(radii + 2 * placed, across, here)
             tl.store(radii + 2 * placed + 1, down, here)
@@ -509,17 +303,17 @@ def _project_kernel(
             tl.store(pixels + 2 * placed + 1, pixel_y, visible)
             tl.store(depths + placed, depth, visible)
 
-        x, y, z, _ = _direction(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
+        x, y, z, _ = direction_to(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
         colored = tl.where(visible, row, 0)  # so that memory of others is not read
-        red, green, blue = _color(first_sh, sh, colored, x, y, z, active, coefficients, apart)
+        red, green, blue = color_of(first_sh, sh, colored, x, y, z, active, coefficients, apart)
         if coefficients > 0 and signed == 0:
             red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
 
         inverse = 1.0 / area
         into = records + placed * record
-        _store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
-        _store_four(into + 4, wide * inverse, effective, effective, effective, visible)
-        _store_four(into + 8, red, green, blue, near, visible)
+        store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
+        store_four(into + 4, wide * inverse, effective, effective, effective, visible)
+        store_four(into + 8, red, green, blue, near, visible)
         if with_geometry:
             tl.store(visible_radii + placed, tl.where(seen, radius, 0).to(tl.int32), here)
             tl.store(visible_pixels + 2 * placed, tl.where(seen, pixel_x - 0.5, 0.0), here)
@@ -596,10 +390,10 @@ def _store_shape_gradients(
     wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
     by_0, by_1, by_2 = ux * a + uy * d + uz * g, vx * b + vy * e + vz * h, wx * c + wy * f + wz * i
     if family:
-        _store_three(by_scale + 3 * rows, 2.0 * s0 * by_0, 2.0 * s1 * by_1, 2.0 * s2 * by_2, here)
+        store_three(by_scale + 3 * rows, 2.0 * s0 * by_0, 2.0 * s1 * by_1, 2.0 * s2 * by_2, here)
     s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
     if not family:
-        _store_three(by_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
+        store_three(by_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
     ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
     of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
     of_x = 2.0 * (-2.0 * x * (vy + wz) + y * (vx + uy) + z * (wx + uz) + w * (vz - wy))
@@ -608,34 +402,36 @@ def _store_shape_gradients(
     if not family:
         along = of_w * w + of_x * x + of_y * y + of_z * z  # its length does not matter
         of_w, of_x, of_y, of_z = of_w - along * w, of_x - along * x, of_y - along * y, of_z - along * z
-    _store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
+    store_four(by_quaternion + 4 * rows, of_w * length, of_x * length, of_y * length, of_z * length, here)
 
 
 @triton.jit
 def _dimming_backward(
-    sharp_wide: tl.tensor, skew: tl.tensor, sharp_high: tl.tensor, blur: float, of_factor: tl.tensor,
-    visible: tl.tensor, exact: tl.constexpr,
+    sharp_wide: tl.tensor, skew: tl.tensor, sharp_high: tl.tensor, blur: float, opacity: tl.tensor,
+    of_wide: tl.tensor, of_skew: tl.tensor, of_high: tl.tensor, of_opacity: tl.tensor, visible: tl.tensor,
 ) -> tl.tensor:  # fmt: skip
-    """Return the factors on opacities, and what they add to the gradients by xx, by xy and yx each, and by yy."""
+    """Return gradients by xx, by xy and yx each, by yy of a covariance and by opacity, from those by dimmed ones."""
     wide, high = sharp_wide + blur, sharp_high + blur
-    area = wide * high - skew * skew
-    factor, share = _dimming(sharp_wide, skew, sharp_high, area, exact)
-    if exact:
-        of_own = tl.where(visible & (factor > 0.0), of_factor / (2.0 * factor * (area + LEAST_AREA)), 0.0)
-        of_area = -of_own * (sharp_wide * sharp_high - skew * skew) / (area + LEAST_AREA)
-        return (
-            factor, of_own * sharp_high + of_area * high, -skew * (of_own + of_area),
-            of_own * sharp_wide + of_area * wide,
-        )  # fmt: skip
-    of_share = tl.where(visible & (share > LEAST_SHARE), of_factor / (2.0 * factor), 0.0)
+    factor, share = _dimming(sharp_wide, skew, sharp_high, wide * high - skew * skew)
+    of_share = tl.where(visible & (share > LEAST_SHARE), of_opacity * opacity / (2.0 * factor), 0.0)
     # The CUDA code differentiates the share at covariances that already have the blur, and not at those that it is
     # computed from.
     larger = (wide + blur) * (high + blur) - skew * skew
-    common = blur * of_share / (larger * larger)
+    common = tl.where(visible, blur * of_share / (larger * larger), 0.0)
     return (
-        factor, (blur * high + high * high + skew * skew) * common, -skew * (blur + wide + high) * common,
-        (blur * wide + wide * wide + skew * skew) * common,
+        of_wide + (blur * high + high * high + skew * skew) * common, of_skew - skew * (blur + wide + high) * common,
+        of_high + (blur * wide + wide * wide + skew * skew) * common, tl.where(visible, of_opacity * factor, 0.0),
     )  # fmt: skip
+
+
+@triton.jit
+def _by_depth(
+    others: tl.tensor, inverse: tl.tensor, visible: tl.tensor, each: tl.constexpr, depth: tl.constexpr
+) -> tl.tensor:
+    """Return the gradient by depth from that by its inverse, which is among the others if there is one."""
+    if depth:
+        return tl.where(visible, -tl.load(others + (each // 2 + 1)), 0.0) * inverse * inverse
+    return 0.0 * inverse
 
 
 @triton.jit(do_not_specialize=("width", "height", "n", "cameras"))
@@ -647,11 +443,11 @@ def _shape_gradient_kernel(
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
     record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
-    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr,
+    dimmed: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
-    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
+    mean_x, mean_y, mean_z = load_three(means + 3 * row)
     w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz = _shape(
         quaternions, scales, row, modifier, family, covariances
     )
@@ -661,7 +457,7 @@ def _shape_gradient_kernel(
     camera = 0
     while camera < cameras:
         placed = camera * n + row
-        visible = _is_visible(radii, placed)
+        visible = is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
         red, green, blue, of_opacity = load_four(found + placed * gradient)
         of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
@@ -676,53 +472,38 @@ def _shape_gradient_kernel(
         )
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, x_by_x, x_by_z, y_by_y, y_by_z)
         if dimmed:
-            cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, px, py, pz)
-            of_xx, of_xy = px * cov_x + py * cov_y + pz * cov_z, qx * cov_x + qy * cov_y + qz * cov_z
-            cov_x, cov_y, cov_z = _times(xx, xy, xz, yy, yz, zz, qx, qy, qz)
-            of_yy = qx * cov_x + qy * cov_y + qz * cov_z
-            factor, of_xx, of_xy, of_yy = _dimming_backward(
-                of_xx, of_xy, of_yy, blur, of_opacity * tl.load(opacities + row), visible, exact
+            of_xx, of_xy, of_yy = _on_screen(xx, xy, xz, yy, yz, zz, px, py, pz, qx, qy, qz)
+            wide, skew, high, of_opacity = _dimming_backward(
+                of_xx, of_xy, of_yy, blur, tl.load(opacities + row), wide, skew, high, of_opacity, visible
             )
-            wide, skew, high = wide + of_xx, skew + of_xy, high + of_yy
-            of_opacity = tl.where(visible, of_opacity * factor, 0.0)
         total += of_opacity
         # By the rows of the projection, halved; and by the covariance in the world.
         fx, fy, fz = wide * px + skew * qx, wide * py + skew * qy, wide * pz + skew * qz
         gx, gy, gz = skew * px + high * qx, skew * py + high * qy, skew * pz + high * qz
-        by_xx += fx * px + gx * qx
-        by_xy += fx * py + gx * qy
-        by_xz += fx * pz + gx * qz
-        by_yy += fy * py + gy * qy
-        by_yz += fy * pz + gy * qz
-        by_zz += fz * pz + gz * qz
+        by_xx, by_xy, by_xz = by_xx + fx * px + gx * qx, by_xy + fx * py + gx * qy, by_xz + fx * pz + gx * qz
+        by_yy, by_yz, by_zz = by_yy + fy * py + gy * qy, by_yz + fy * pz + gy * qz, by_zz + fz * pz + gz * qz
         fx, fy, fz = _times(xx, xy, xz, yy, yz, zz, fx, fy, fz)
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
-        of_depth = none
-        if depth:
-            of_inverse = tl.load(others + placed * each + (each // 2 + 1))
-            of_depth = tl.where(visible, -of_inverse * inverse * inverse, 0.0)
         right, under, ahead = _grad_of_mean(
-            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y, of_depth,
-            fx, fy, fz, gx, gy, gz, family,
+            poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y,
+            _by_depth(others + placed * each, inverse, visible, each, depth), fx, fy, fz, gx, gy, gz, family,
         )  # fmt: skip
-        by_x += right
-        by_y += under
-        by_z += ahead
+        by_x, by_y, by_z = by_x + right, by_y + under, by_z + ahead
         if colored:
             red, green = tl.where(visible, red, 0.0), tl.where(visible, green, 0.0)
-            _store_three(by_color + 3 * rows, red, green, tl.where(visible, blue, 0.0), here)
+            store_three(by_color + 3 * rows, red, green, tl.where(visible, blue, 0.0), here)
         if columns > 0:
             _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * each, 0.5 * width,
                                     0.5 * height, visible, here, columns)  # fmt: skip
         camera += 1
-    _store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
+    store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
     if not family:
         opacity = 1.0 / (1.0 + tl.exp(-tl.load(opacities + row)))
         total *= opacity * (1.0 - opacity)
     tl.store(by_opacity + rows, total, here)
     if covariances:
-        _store_three(by_scale + 6 * rows, by_xx, 2.0 * by_xy, 2.0 * by_xz, here)
-        _store_three(by_scale + 6 * rows + 3, by_yy, 2.0 * by_yz, by_zz, here)
+        store_three(by_scale + 6 * rows, by_xx, 2.0 * by_xy, 2.0 * by_xz, here)
+        store_three(by_scale + 6 * rows + 3, by_yy, 2.0 * by_yz, by_zz, here)
     else:
         _store_shape_gradients(
             by_quaternion, by_scale, rows, here, w, x, y, z, length, s0, s1, s2,
@@ -743,119 +524,6 @@ def _store_screen_gradients(
         tl.store(into + 3, tl.where(visible, tl.load(others + 2) * half_height, 0.0), here)
     else:
         tl.store(into + 2, 0.0 * of_x, here)
-
-
-@triton.jit
-def _slopes(
-    k: tl.constexpr, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
-    red: tl.tensor, green: tl.tensor, blue: tl.tensor, of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor,
-) -> tl.tensor:  # fmt: skip
-    """Return what the k-th spherical harmonic adds to the gradient by x, y and z of the direction."""
-    weight = red * of_red + green * of_green + blue * of_blue
-    weight = tl.where(_is_used(k, active), weight, 0.0)
-    return _basis_x(k, x, y, z) * weight, _basis_y(k, x, y, z) * weight, _basis_z(k, x, y, z) * weight
-
-
-@triton.jit
-def _by_direction(
-    first: tl.tensor, sh: tl.tensor, row: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, active: int,
-    of_red: tl.tensor, of_green: tl.tensor, of_blue: tl.tensor, coefficients: tl.constexpr, apart: tl.constexpr,
-) -> tl.tensor:  # fmt: skip
-    """Return the gradient by x, y and z of the directions from that by colours."""
-    start = sh + row * (3 * coefficients)
-    by_x, by_y, by_z = 0.0 * x, 0.0 * x, 0.0 * x
-    if coefficients % 4 == 0 and not apart:
-        for k in tl.static_range(0, coefficients, 4):
-            if k < active:
-                r0, g0, b0, r1 = load_four(start + 3 * k)
-                g1, b1, r2, g2 = load_four(start + 3 * k + 4)
-                b2, r3, g3, b3 = load_four(start + 3 * k + 8)
-                x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
-                x1, y1, z1 = _slopes(k + 1, x, y, z, active, r1, g1, b1, of_red, of_green, of_blue)
-                x2, y2, z2 = _slopes(k + 2, x, y, z, active, r2, g2, b2, of_red, of_green, of_blue)
-                x3, y3, z3 = _slopes(k + 3, x, y, z, active, r3, g3, b3, of_red, of_green, of_blue)
-                by_x += x0 + x1 + x2 + x3
-                by_y += y0 + y1 + y2 + y3
-                by_z += z0 + z1 + z2 + z3
-    else:
-        for k in tl.static_range(1, coefficients):  # the first one is the same in all directions
-            r0, g0, b0 = _load_three(_coefficient(first, sh, row, k, coefficients, apart))
-            x0, y0, z0 = _slopes(k, x, y, z, active, r0, g0, b0, of_red, of_green, of_blue)
-            by_x += x0
-            by_y += y0
-            by_z += z0
-    return by_x, by_y, by_z
-
-
-@triton.jit
-def _store_sh(
-    by_first: tl.tensor, by_sh: tl.tensor, rows: tl.tensor, red: tl.tensor, green: tl.tensor, blue: tl.tensor,
-    k: tl.tensor, here: tl.tensor, coefficients: tl.constexpr, apart: tl.constexpr,
-) -> None:  # fmt: skip
-    """Store red, green and blue (k, g) of each coefficient.
-
-    Threads first exchange numbers, so that those beside each other store a row together: Triton gives the channels, and
-    then the coefficients, to consecutive threads.
-    """
-    channel = tl.arange(0, 4)[None, None, :]
-    values = tl.reshape(
-        tl.join(tl.join(red, blue), tl.join(green, tl.zeros_like(red))), (red.shape[0], red.shape[1], 4)
-    )
-    k, rows = k[:, :, None], rows[None, :, None]
-    wanted = here[None, :, None] & (channel < 3) & (k < coefficients)
-    if apart:
-        tl.store(by_first + 3 * (rows + 0 * k) + channel, values, wanted & (k == 0))
-        tl.store(by_sh + (rows * (coefficients - 1) + k - 1) * 3 + channel, values, wanted & (k > 0))
-    else:
-        tl.store(by_sh + (rows * coefficients + k) * 3 + channel, values, wanted)
-
-
-@triton.jit(do_not_specialize=NOT_SPECIALIZED)
-def _color_gradient_kernel(
-    means: tl.tensor, centres: tl.tensor, sh: tl.tensor, first_sh: tl.tensor, radii: tl.tensor, records: tl.tensor,
-    found: tl.tensor, by_mean: tl.tensor, by_sh: tl.tensor, by_first: tl.tensor,
-    n: tl.tensor, cameras: int, active: int, signed: int,
-    record: tl.constexpr, color_in_record: tl.constexpr, gradient: tl.constexpr,
-    coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr, apart: tl.constexpr,
-) -> None:  # fmt: skip
-    rows = tl.program_id(0) * block + tl.arange(0, block)
-    here, row = rows < n, tl.minimum(rows, n - 1)
-    k = tl.arange(0, padded)[:, None]  # of sums, which a thread has in its registers
-    red = tl.zeros((padded, block), tl.float32)
-    green, blue = tl.zeros_like(red), tl.zeros_like(red)
-    mean_x, mean_y, mean_z = _load_three(means + 3 * row)
-    by_x, by_y, by_z = 0.0 * mean_x, 0.0 * mean_x, 0.0 * mean_x
-    camera = 0
-    while camera < cameras:
-        placed = camera * n + row
-        visible = _is_visible(radii, placed)
-        placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        of_red, of_green, of_blue, _ = load_four(found + placed * gradient)
-        color_r, color_g, color_b, _ = load_four(records + placed * record + color_in_record)
-        of_red = tl.where(visible & ((signed != 0) | (color_r > 0.0)), of_red, 0.0)
-        of_green = tl.where(visible & ((signed != 0) | (color_g > 0.0)), of_green, 0.0)
-        of_blue = tl.where(visible & ((signed != 0) | (color_b > 0.0)), of_blue, 0.0)
-        x, y, z, near = _direction(centres + 3 * camera, mean_x, mean_y, mean_z, visible)
-        basis = tl.zeros_like(red)
-        for i in tl.static_range(coefficients):
-            basis = tl.where(k == i, _used_basis(i, x, y, z, active)[None], basis)
-        red += basis * of_red[None]
-        green += basis * of_green[None]
-        blue += basis * of_blue[None]
-        if coefficients > 1:
-            source = tl.where(visible, row, 0)
-            in_x, in_y, in_z = _by_direction(
-                first_sh, sh, source, x, y, z, active, of_red, of_green, of_blue, coefficients, apart
-            )
-            radial = in_x * x + in_y * y + in_z * z  # moving along the direction does not change it
-            by_x += (in_x - radial * x) * near
-            by_y += (in_y - radial * y) * near
-            by_z += (in_z - radial * z) * near
-        camera += 1
-    _store_sh(by_first, by_sh, rows, red, green, blue, k, here, coefficients, apart)
-    if coefficients > 1:
-        before_x, before_y, before_z = _load_three(by_mean + 3 * row)
-        _store_three(by_mean + 3 * rows, before_x + by_x, before_y + by_y, before_z + by_z, here)
 
 
 @triton.jit(do_not_specialize=("width", "height", "down_1", "right_1", "down_2", "right_2"))
@@ -959,8 +627,7 @@ def _project(
         *given, given.sh if first is None else first, *cameras[:3], *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
         coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
-        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
-        exact=rules.exact, snug=rules.snug,
+        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed, snug=rules.snug,
     )  # fmt: skip
 
 
@@ -1015,12 +682,12 @@ def _project_backward(
         cameras.width, cameras.height, n, count, *numbers[:2],
         record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
-        dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth,
+        dimmed=rules.dimmed, depth=rules.depth,
     )  # fmt: skip
     if coefficients == 0:
         return
     launch(
-        _color_gradient_kernel, (blocks(n, BLOCK),),
+        color_gradient_kernel, (blocks(n, BLOCK),),
         given.means, cameras.centres, given.sh, given.sh if first is None else first, radii, records, found,
         by.means, by.sh, by.sh if by_first is None else by_first,
         n, count, (degree + 1) ** 2, int(signed),

@@ -42,12 +42,48 @@ OF_SUMS, SQUARES, REMAINDERS = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 LAST = tl.constexpr(2**31 - 1)
 
 
+@triton.jit
+def _add_sums(
+    share: tl.tensor, weight: tl.tensor, distance: tl.tensor, into: tl.tensor, there: tl.tensor
+) -> None:  # fmt: skip
+    """Add a bucket's sums over pixels to those of all tiles."""
+    blended = share > 0.0
+    of_weight = tl.sum(tl.where(blended, weight, 0.0), 3, keep_dims=True)
+    of_one = tl.sum(tl.where(blended, 1.0, 0.0), 3, keep_dims=True)
+    of_share = tl.sum(share, 3, keep_dims=True)
+    of_distance = tl.sum(tl.where(blended, distance, 0.0), 3, keep_dims=True)
+    # What is left in the thread of column i is the i-th sum.
+    total = sum_of_pair(sum_of_pair(of_weight, of_share, 2), sum_of_pair(of_one, of_distance, 2), 1)
+    tl.atomic_add(into + tl.arange(0, LANES)[:, None, None, None], total, there, sem="relaxed")
+
+
+@triton.jit
+def _slopes(
+    added: tl.tensor, shade: tl.tensor, behind: tl.tensor, inverse: tl.tensor
+) -> tuple[tl.tensor, tl.tensor]:  # fmt: skip
+    """Return gradients by alphas, see `blend_kernels`, and what reaches the eye from behind the bucket.
+
+    Args:
+        added: products of what Gaussians add to the pixels and the pixels' gradients.
+        shade: those of transmittances before Gaussians, colours and gradients.
+        behind: what reaches the eye from the bucket and behind it, times the gradients.
+        inverse: of 1 less alphas.
+    """
+    second = tl.arange(0, added.shape[2])[None, None, :, None] == 1  # of a thread's Gaussians
+    by_both = tl.sum(added, 2, keep_dims=True)
+    by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
+    added_before, by_all = before_and_all(by_both, True)
+    still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
+    return shade - still_behind * inverse, behind - by_all
+
+
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def _sum_kernel(
     records: tl.tensor, offsets: tl.tensor, flat: tl.tensor, words: tl.tensor, counts: tl.tensor, images: tl.tensor,
     by_images: tl.tensor, weights: tl.tensor, sums: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, what: tl.constexpr,
+    each: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel of blending.
     bucket: tl.constexpr = splats * SPLAT_LANES
@@ -58,7 +94,6 @@ def _sum_kernel(
     inside = (column + along < width) & (row + down < height)
     place = (row + down) * width + column + along
     transmittance = tl.where(inside, 1.0, 0.0)
-    second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
     if what == SQUARES:
         at_red, at_green, at_blue = pixels_of(image, place, width * height, True)
         by_red = tl.load(by_images + at_red, inside, 0.0)
@@ -88,32 +123,19 @@ def _sum_kernel(
         before, after, transmittance = transmittances_of(alpha, transmittance)
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
         share = alpha * before
-        lane = tl.arange(0, LANES)[:, None, None, None]
         if what == OF_SUMS:
-            blended = share > 0.0
-            of_weight = tl.sum(tl.where(blended, of_pixel, 0.0), 3, keep_dims=True)
-            of_one = tl.sum(tl.where(blended, 1.0, 0.0), 3, keep_dims=True)
-            of_share = tl.sum(share, 3, keep_dims=True)
-            of_distance = tl.sum(tl.where(blended, tl.sqrt(x * x + y * y), 0.0), 3, keep_dims=True)
-            # In the thread of column i is the i-th sum.
-            pair = sum_of_pair(of_weight, of_share, 2)
-            total = sum_of_pair(pair, sum_of_pair(of_one, of_distance, 2), 1)
-            tl.atomic_add(sums + 5 * gaussian + lane, total, there, sem="relaxed")
+            _add_sums(share, of_pixel, tl.sqrt(x * x + y * y), sums + each * gaussian, there)
         else:
             if what == SQUARES:
                 shade = red * by_red + green * by_green + blue * by_blue
-                added = share * shade
-                by_both = tl.sum(added, 2, keep_dims=True)
-                by_first = tl.sum(tl.where(second, 0.0, added), 2, keep_dims=True)
-                added_before, by_all = before_and_all(by_both, True)
-                still_behind = (behind - added_before) - tl.where(second, by_both, by_first)
-                behind -= by_all
-                slope = opacity * (before * shade - still_behind * inverse)
-                found = tl.where(alpha > 0.0, slope * slope, 0.0)
+                slope, behind = _slopes(share * shade, before * shade, behind, inverse)
+                found = tl.where(alpha > 0.0, opacity * slope, 0.0)
+                found *= found
             else:
                 found = share * (1.0 - alpha) * of_pixel
             total = tl.sum(tl.sum(found, 3, keep_dims=True), 0, keep_dims=True)
-            tl.atomic_add(sums + gaussian, tl.where(lane == 0, total, 0.0), there & (lane == 0), sem="relaxed")
+            first = tl.arange(0, LANES)[:, None, None, None] == 0
+            tl.atomic_add(sums + each * gaussian, tl.where(first, total, 0.0), there & first, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
@@ -192,7 +214,7 @@ def _launch(kernel: object, seen: Blended, *more: Tensor, **constants: int) -> N
 
 def _sum(seen: Blended, weights: Tensor, by_image: Tensor, columns: int, what: int) -> Tensor:
     sums = seen.records.new_zeros(seen.records.numel() // RECORD, columns)
-    _launch(_sum_kernel, seen, seen.image, by_image, weights, sums, what=what)
+    _launch(_sum_kernel, seen, seen.image, by_image, weights, sums, what=what, each=columns)
     return sums
 
 

@@ -7,13 +7,13 @@ gradients and sums over pixels go this way.
 
 from __future__ import annotations
 
-import os
 from typing import NamedTuple
 
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.memory_kernels import INTERPRETED, load_four
 from lapgs_plugin.gpu_raster.records import TILE, grid_of
 from lapgs_plugin.reference_raster.layout import MAX_ALPHA
 
@@ -28,7 +28,6 @@ FAINTEST = tl.constexpr(1 / 255)
 OPAQUEST, OPAQUEST_OF_FAMILY = tl.constexpr(0.999), tl.constexpr(MAX_ALPHA)
 LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
-INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
 
 # Kernels are not compiled anew for other sizes.
 NOT_SPECIALIZED = ("width", "height", "across", "tiles", "known", "pairs")
@@ -75,17 +74,6 @@ def inverse_of(x: tl.tensor) -> tl.tensor:
     if INTERPRETED:
         return 1.0 / x
     return tl.inline_asm_elementwise("rcp.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
-
-
-@triton.jit
-def load_four(start: tl.tensor) -> tl.tensor:
-    """Load four numbers that begin at a multiple of 16 bytes; where compiled, in one instruction."""
-    if INTERPRETED:
-        return tl.load(start), tl.load(start + 1), tl.load(start + 2), tl.load(start + 3)
-    return tl.inline_asm_elementwise(
-        "ld.global.nc.v4.f32 {$0, $1, $2, $3}, [$4];", "=f,=f,=f,=f,l", [start],
-        (tl.float32, tl.float32, tl.float32, tl.float32), True, 1,
-    )  # fmt: skip
 
 
 @triton.jit
