@@ -32,8 +32,10 @@ from lapgs_plugin.reference_raster.layout import (
     JACOBIAN_LIMIT,
     MAX_RADIUS,
     MIN_ROOT,
+    MIN_SHARE,
     NEAR_DEPTH,
     RADIUS_SIGMAS,
+    VANISHING,
 )
 
 BLOCK = 128
@@ -46,8 +48,8 @@ BEYOND = tl.constexpr(0.3)
 CENTRED, SIGMAS, LEAST_ROOT = tl.constexpr(JACOBIAN_LIMIT), tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
 """The family's: the Jacobian's limit in half images from the centre, and numbers of its three-sigma radius."""
 LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
-LEAST_SHARE = tl.constexpr(2.5e-5)
-"""Lower bound, where Gaussians are dimmed, of the determinant without the blur over that with it."""
+LEAST_SHARE, LEAST_AREA = tl.constexpr(MIN_SHARE), tl.constexpr(VANISHING)
+"""Where Gaussians are dimmed: lower bounds of the determinant without the blur over that with it, and of the first."""
 
 
 @triton.jit
@@ -240,13 +242,19 @@ def _footprint(
 
 
 @triton.jit
-def _dimming(wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor) -> tl.tensor:
+def _dimming(
+    wide: tl.tensor, skew: tl.tensor, high: tl.tensor, area: tl.tensor, exact: tl.constexpr
+) -> tl.tensor:  # fmt: skip
     """Return the factors on opacities of antialiasing, and the shares that they are the roots of.
 
     Of the arguments `area` alone has the blur.
     """
-    share = (wide * high - skew * skew) / area
-    return tl.sqrt(tl.maximum(share, LEAST_SHARE)), share
+    own = wide * high - skew * skew
+    share = own / area
+    factor = tl.sqrt(tl.maximum(share, LEAST_SHARE))
+    if exact:
+        factor = tl.where(own > LEAST_AREA, tl.sqrt(tl.abs(own / (area + LEAST_AREA)) + LEAST_AREA), 0.0)
+    return factor, share
 
 
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
@@ -259,7 +267,7 @@ def _project_kernel(
     modifier: float, blur: float, mult: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
     tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    snug: tl.constexpr,
+    exact: tl.constexpr, snug: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -282,7 +290,7 @@ def _project_kernel(
         area = wide * high - skew * skew
         effective = opacity
         if dimmed:
-            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area)[0]
+            effective = opacity * _dimming(sharp_wide, skew, sharp_high, area, exact)[0]
         if family:
             in_columns, in_rows, radius, seen = _footprint(
                 pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective, here & (depth > NEAR),
@@ -409,18 +417,29 @@ def _store_shape_gradients(
 def _dimming_backward(
     sharp_wide: tl.tensor, skew: tl.tensor, sharp_high: tl.tensor, blur: float, opacity: tl.tensor,
     of_wide: tl.tensor, of_skew: tl.tensor, of_high: tl.tensor, of_opacity: tl.tensor, visible: tl.tensor,
+    exact: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return gradients by xx, by xy and yx each, by yy of a covariance and by opacity, from those by dimmed ones."""
     wide, high = sharp_wide + blur, sharp_high + blur
-    factor, share = _dimming(sharp_wide, skew, sharp_high, wide * high - skew * skew)
-    of_share = tl.where(visible & (share > LEAST_SHARE), of_opacity * opacity / (2.0 * factor), 0.0)
+    area = wide * high - skew * skew
+    factor, share = _dimming(sharp_wide, skew, sharp_high, area, exact)
+    of_factor = of_opacity * opacity
+    of_opacity = tl.where(visible, of_opacity * factor, 0.0)
+    if exact:
+        of_own = tl.where(visible & (factor > 0.0), of_factor / (2.0 * factor * (area + LEAST_AREA)), 0.0)
+        of_area = -of_own * (sharp_wide * sharp_high - skew * skew) / (area + LEAST_AREA)
+        return (
+            of_wide + of_own * sharp_high + of_area * high, of_skew - skew * (of_own + of_area),
+            of_high + of_own * sharp_wide + of_area * wide, of_opacity,
+        )  # fmt: skip
+    of_share = tl.where(visible & (share > LEAST_SHARE), of_factor / (2.0 * factor), 0.0)
     # The CUDA code differentiates the share at covariances that already have the blur, and not at those that it is
     # computed from.
     larger = (wide + blur) * (high + blur) - skew * skew
     common = tl.where(visible, blur * of_share / (larger * larger), 0.0)
     return (
         of_wide + (blur * high + high * high + skew * skew) * common, of_skew - skew * (blur + wide + high) * common,
-        of_high + (blur * wide + wide * wide + skew * skew) * common, tl.where(visible, of_opacity * factor, 0.0),
+        of_high + (blur * wide + wide * wide + skew * skew) * common, of_opacity,
     )  # fmt: skip
 
 
@@ -443,7 +462,7 @@ def _shape_gradient_kernel(
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
     record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
-    dimmed: tl.constexpr, depth: tl.constexpr,
+    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -474,7 +493,7 @@ def _shape_gradient_kernel(
         if dimmed:
             of_xx, of_xy, of_yy = _on_screen(xx, xy, xz, yy, yz, zz, px, py, pz, qx, qy, qz)
             wide, skew, high, of_opacity = _dimming_backward(
-                of_xx, of_xy, of_yy, blur, tl.load(opacities + row), wide, skew, high, of_opacity, visible
+                of_xx, of_xy, of_yy, blur, tl.load(opacities + row), wide, skew, high, of_opacity, visible, exact
             )
         total += of_opacity
         # By the rows of the projection, halved; and by the covariance in the world.
@@ -627,7 +646,8 @@ def _project(
         *given, given.sh if first is None else first, *cameras[:3], *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
         coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
-        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed, snug=rules.snug,
+        family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
+        exact=rules.exact, snug=rules.snug,
     )  # fmt: skip
 
 
@@ -682,7 +702,7 @@ def _project_backward(
         cameras.width, cameras.height, n, count, *numbers[:2],
         record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
-        dimmed=rules.dimmed, depth=rules.depth,
+        dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth,
     )  # fmt: skip
     if coefficients == 0:
         return
