@@ -142,7 +142,8 @@ class _Rasterize(torch.autograd.Function):
             call.blended = Blended(seen.records, *tiles, image, counts, words)
         radii, centres, depths = seen.visible_radii[0], seen.centres[0], seen.depths[0]
         ctx.mark_non_differentiable(radii, centres, depths)
-        return image[0], inverse_depths, radii, centres, depths
+        # Copies, which checkouts may change in place as they may those of the CUDA code.
+        return image[0].clone(), inverse_depths.clone(), radii, centres, depths
 
     @staticmethod
     @once_differentiable

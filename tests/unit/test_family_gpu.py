@@ -63,6 +63,12 @@ def inputs_of(case, device, columns=3, apart=False, given=False):
     return Inputs(**{key: leaves.get(key) for key in Inputs._fields})
 
 
+def small(sh_degree=3, signed=False, width=29, height=15, **more):
+    camera = make_camera(width, height, pose_seed=7, principal_offset=(3.0, -2.0))
+    more |= {"seed": 5, "sh_degree": sh_degree, "signed": signed, "background": COLORED, "camera": camera}
+    return random_case(20, width, height, **more).to(torch.float32)
+
+
 def relative(found, expected):
     return float((found.cpu().double() - expected.double()).norm() / expected.double().norm().clamp_min(1e-6))
 
@@ -124,22 +130,20 @@ def check(name, case, options=Options(), modifier=1.0, limit=2e-5, **how):
     camera = case.camera
     weights = torch.randn(4, camera.height, camera.width, generator=torch.Generator().manual_seed(1))
     found = []
-    agree = torch.ones(())
-    for engine, device in ((cpu, "cpu"), (gpu, DEVICE), (cpu, "cpu"), (gpu, DEVICE)):
+    for engine, device in ((cpu, "cpu"), (gpu, DEVICE)):
         inputs = inputs_of(case, device, **how)
         output = engine.rasterize(settings_of(case, device, modifier), inputs, options)
         images = output.image if output.inverse_depths is None else torch.cat([output.image, output.inverse_depths])
         found.append((images, output, inputs))
-        if len(found) == 2:
-            # A comparison that rounding turns in one of both changes a pixel by 1/255 of a colour.
-            off = (found[0][0].detach() - found[1][0].detach().cpu()).abs().amax(0)
-            agree = (off < 1e-4).float()
-            assert agree.mean() > 0.99, name
-            print(name, f"image {float((off * agree).max()):.1e}", end=" ")
-            assert (off * agree).max() < limit
-    for images, *_ in found[2:]:
-        (images * (weights[: len(images)] * agree).to(images.device)).sum().backward()
-    (_, one, expected), (_, other, inputs) = found[2:]
+    (exact, one, expected), (images, other, inputs) = found
+    # A comparison that rounding turns in one of both changes a pixel by 1/255 of a colour.
+    off = (exact.detach() - images.detach().cpu()).abs().amax(0)
+    agree = (off < 1e-4).float()
+    assert agree.mean() > 0.99, name
+    print(name, f"image {float((off * agree).max()):.1e}", end=" ")
+    assert (off * agree).max() < limit
+    for each in (exact, images):
+        (each * (weights[: len(each)] * agree).to(each.device)).sum().backward()
     for key in ("radii", "depths", "centres"):
         close = torch.isclose(getattr(one, key).float(), getattr(other, key).cpu().float(), rtol=1e-4, atol=1e-3)
         assert close.float().mean() > 0.98, (name, key)
@@ -152,12 +156,8 @@ def check(name, case, options=Options(), modifier=1.0, limit=2e-5, **how):
         assert off < limit, (name, key, off)
     print()
 
-def small(sh_degree=3, signed=False, n=30, offset=(3.0, -2.0), **more):
-    camera = make_camera(35, 21, pose_seed=7, principal_offset=offset)
-    case = random_case(n, 35, 21, seed=5, sh_degree=sh_degree, signed=signed, background=COLORED, camera=camera, **more)
-    return case.to(torch.float32)
-
-check("signed", small(1, signed=True))  # worst seen 2e-6
+# Worst seen 7.3e-6.
+check("signed", small(1, signed=True, width=35, height=21))
 check("apart", replace(small(3), sh_degree=2), apart=True, columns=4)
 check("dc alone", small(0), apart=True)
 check("modifier", small(2), modifier=0.6)
@@ -167,7 +167,8 @@ check("dimmed given", small(1, pixels=(0.05, 3.0)), Options(antialiasing=True, i
 check("depth", small(0), Options(inverse_depth=True))
 check("depth and absolute", small(0), Options(inverse_depth=True), columns=4)
 check("blur", small(1), Options(blur=0.05))
-check("dimmed blur", small(1, pixels=(0.05, 3.0)), Options(antialiasing=True, blur=0.1))
+exactly = Options(antialiasing=True, exact_antialiasing=True, blur=0.1)
+check("dimmed exactly", small(1, pixels=(0.05, 3.0)), exactly)
 for mult in (0.3, 1.0):
     check("snug", small(1, pixels=(1.0, 9.0)), Options(mult=mult), columns=4, apart=True)
 """
@@ -208,8 +209,27 @@ def check(name, case, mult=None):
     assert alone.contributions.weights is None
     assert alone.blending is None
 
-for name, mult in (("ragged_size", None), ("crowd", 0.5), ("saturated", None)):
-    check(name, ADVERSARIAL[name]().to(torch.float32), mult)
+check("snug", small(1), 0.5)
+opaque = small(0)
+check("opaque", replace(opaque, field=opaque.field.with_parameters({"opacity_logits": torch.linspace(4.0, 9.0, 20)})))
+"""
+
+CHANGED_IN_PLACE = """
+case = small(0, width=17, height=9)
+found = []
+for changed in (False, True):
+    inputs = inputs_of(case, DEVICE)
+    output = gpu.rasterize(settings_of(case, DEVICE), inputs, Options(inverse_depth=True))
+    image, depths = output.image, output.inverse_depths
+    if changed:
+        image *= 0.5
+        depths *= 0.5
+        output.radii[:3] = 0
+        image, depths = 2 * image, 2 * depths
+    (image.square().sum() + depths.square().sum()).backward()
+    found.append(gradients(inputs))
+for key, value in found[0].items():
+    assert relative(found[1][key], value) < 1e-6, key  # worst seen 1e-7
 """
 
 needs_triton = pytest.mark.skipif(
@@ -224,7 +244,7 @@ LIMIT, LIMITS = 5e-5, {("needles", "scales"): 1e-2, ("needles", "quats"): 2e-3, 
 
 @needs_triton
 def test_plain_rules_interpreted_against_the_oracle() -> None:
-    names = ["one_pixel", "saturated", "needles", "off_centre", "wide_angle", "large_quaternions", "no_gaussians"]
+    names = ["one_pixel", "saturated", "needles", "off_centre", "large_quaternions", "no_gaussians"]
     run_checks("cpu", f"NAMES = {names}\n{COMMON}{LIMITS}{PLAIN}", TRITON_INTERPRET="1")
 
 
@@ -241,4 +261,9 @@ def test_sums_over_pixels_interpreted_against_the_engine_of_the_cpu() -> None:
 @pytest.mark.gpu
 @needs_cuda
 def test_compiled() -> None:
-    run_checks("cuda", f"NAMES = []\n{COMMON}{LIMITS}{PLAIN}{OPTIONS}{SUMS_OVER_PIXELS}")
+    run_checks("cuda", f"NAMES = []\n{COMMON}{LIMITS}{PLAIN}{OPTIONS}{SUMS_OVER_PIXELS}{CHANGED_IN_PLACE}")
+
+
+@needs_triton
+def test_outputs_may_be_changed_in_place() -> None:
+    run_checks("cpu", COMMON + CHANGED_IN_PLACE, TRITON_INTERPRET="1")
