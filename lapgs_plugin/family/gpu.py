@@ -37,7 +37,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     """
     call = _Call(settings, inputs, options)
     image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
-    return Output(
+    output = Output(
         image,
         radii,
         inverse_depths if options.inverse_depth else None,
@@ -46,6 +46,8 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
         _contributions(call, options) if options.sums else None,
         _Blending(call) if options.blending else None,
     )
+    call.blended = None  # the backward pass needs less
+    return output
 
 
 class _Call:
@@ -143,7 +145,8 @@ class _Rasterize(torch.autograd.Function):
         radii, centres, depths = seen.visible_radii[0], seen.centres[0], seen.depths[0]
         ctx.mark_non_differentiable(radii, centres, depths)
         # Copies, which checkouts may change in place as they may those of the CUDA code.
-        return image[0].clone(), inverse_depths.clone(), radii, centres, depths
+        by_depth = inverse_depths.clone() if call.rules.depth else inverse_depths
+        return image[0].clone(), by_depth, radii, centres, depths
 
     @staticmethod
     @once_differentiable

@@ -95,7 +95,7 @@ def blend_family_in_tiles(
         tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, room, True)
         return tiles, blend_family(records, background, *tiles, size, rules, mult)
 
-    return _with_room((records.device, *size, rules.snug), ends[-1], attempt)
+    return _with_room((records.device, *size, rules), ends[-1], attempt)
 
 
 def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
