@@ -142,7 +142,8 @@ def raw(device):
 
 if EXTRAS:
     close("mini-splatting2, render_simp", simply)
-    close("mini-splatting, render_depth", depths, 1e-2)  # float32 of a difference of squares; worst seen: XX
+    assert (depths("cpu")["rendered_depth"] > 0).any(), "nothing is blended here: the test shows nothing"
+    close("mini-splatting, render_depth", depths)  # worst seen: 3e-7
     close("faster-gs", raw)
 """
 
