@@ -19,9 +19,9 @@ from gsplat.cuda import _torch_impl, _wrapper
 from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
-from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.records import Parameters, Projected, grid_of, records_of
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
-from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected, grid_of, records_of
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -351,7 +351,7 @@ def direct_on_cpu(**others: Callable[..., Any]) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, functions in KERNEL_MODULES.items():
             chosen = {key: others.get(key, function) for key, function in functions.items()}
-            patch.setitem(sys.modules, f"lapgs_plugin.rasterizers.gsplat.{name}", SimpleNamespace(**chosen))
+            patch.setitem(sys.modules, f"lapgs_plugin.gpu_raster.{name}", SimpleNamespace(**chosen))
         yield
 
 

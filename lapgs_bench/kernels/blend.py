@@ -16,13 +16,13 @@ from lapgs_bench.kernels.random_scene import make_scene
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.gpu_raster.cameras import CameraCache
+from lapgs_plugin.gpu_raster.records import COLOR_IN_RECORD, TILE, Parameters, grid_of
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
-from lapgs_plugin.rasterizers.gsplat.records import COLOR_IN_RECORD, TILE, Parameters, grid_of
 from lapgs_plugin.rendering.rig import looking, unit
 
 if TYPE_CHECKING:
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape
+    from lapgs_plugin.gpu_raster.walk_kernels import Shape
 
 
 @dataclass(frozen=True)
@@ -63,21 +63,21 @@ class Sorted(NamedTuple):
 
 
 def parse_shapes(text: str | None) -> dict[str, Shape]:
-    """Parse shapes such as "4x2,8x1", in the order of `blend_kernels.Shape`; None for the default one.
+    """Parse shapes such as "4x2,8x1", in the order of `walk_kernels.Shape`; None for the default one.
 
     Raises:
         UserInputError: an entry is not one or two powers of 2, or has too many rows or Gaussians, or too few rows.
     """
-    from lapgs_plugin.rasterizers.gsplat import blend_kernels
+    from lapgs_plugin.gpu_raster import walk_kernels
 
     if text is None:
-        text = "x".join(map(str, blend_kernels.SHAPE))
+        text = "x".join(map(str, walk_kernels.SHAPE))
     shapes = {}
     for entry in text.split(","):
         numbers = [int(number) if number.isdecimal() else 0 for number in entry.strip().split("x")]
         if not 1 <= len(numbers) <= 2 or any(number < 1 or number & (number - 1) for number in numbers):
             raise UserInputError(f"--shapes {entry!r}: expected one or two powers of 2 such as 4x2")
-        shape = blend_kernels.Shape(*numbers)
+        shape = walk_kernels.Shape(*numbers)
         if not 2 <= shape.rows <= TILE or shape.splats > 2:
             raise UserInputError(f"--shapes {entry!r}: expected ROWS[xSPLATS] with 2 to {TILE} ROWS and 1 or 2 SPLATS")
         shapes[entry.strip()] = shape
@@ -141,7 +141,7 @@ def gsplats_kernels(tiles: Sorted, size: tuple[int, int]) -> Kernels:
 
 def our_kernels(tiles: Sorted, size: tuple[int, int], shape: Shape) -> Kernels:
     """Return ours, in one shape."""
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward, blend_forward
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_backward, blend_forward
 
     def backward(blended: Sequence[Tensor], by_images: Tensor) -> Sequence[Tensor]:
         images, counts, words = blended

@@ -27,12 +27,18 @@ COLUMNS = {
     "sh": "SH",
 }
 """Titles of the errors in the table."""
+FAMILY = "family"
+"""Our versions of the 3DGS family's rasterizers."""
 
 
 def conformance(
     rasterizer: Annotated[
         list[str] | None,
-        typer.Option("--rasterizer", help="Rasterizer to check. Repeatable. Default: all that this machine can run."),
+        typer.Option(
+            "--rasterizer",
+            help="Rasterizer to check. Repeatable. `family` checks our version of each rasterizer of the 3DGS family. "
+            "Default: all that this machine can run, but `family`, which takes minutes.",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all errors as JSON, for scripts.")] = False,
 ) -> None:
@@ -42,6 +48,7 @@ def conformance(
     table shows the worst error of each scene: absolute for pixels, relative to the largest value for gradients. "band"
     counts pixels that depend on a comparison which rounding can turn; they are only checked for plausibility.
 
+    Our versions of the 3DGS family's rasterizers are checked in each one's rules, on the CPU and on a GPU.
     A CUDA extension is checked with its native signed colour, if it has any, and with colours precomputed in PyTorch.
     gsplat compiles its CUDA code at first use, which takes minutes. The exit code is 1 if a check fails.
     """
@@ -73,6 +80,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     subjects: dict[str, Callable[[], list[Subject]]] = {
         "cpu": lambda: [Subject("cpu", CpuRasterizer()), Subject("cpu, float64", CpuRasterizer(), torch.float64)],
         "oracle": lambda: [Subject("oracle, float32", OracleRasterizer())],
+        FAMILY: _family_subjects,
     }
     if torch.cuda.is_available():
         for name in installed_extensions():
@@ -90,6 +98,16 @@ def _subject(name: str) -> list[Subject]:
 
     placed = placed_rasterizer(name)
     return [Subject(name, placed.rasterizer, device=placed.device.type, semantics=placed.rasterizer.semantics)]
+
+
+def _family_subjects() -> list[Subject]:
+    """Return our version of each variant, by each engine that this machine can run."""
+    import torch
+
+    from lapgs_plugin.evaluation.variants import variant_subjects
+
+    devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+    return [subject for device in devices for subject in variant_subjects(device)]
 
 
 def _extension_subjects(name: str) -> list[Subject]:
@@ -119,7 +137,8 @@ def _chosen(names: Sequence[str]) -> list[Subject]:
                 f"--rasterizer {name}: expected one that this machine can run: {', '.join(available)}; "
                 "`lapgs doctor` says what is missing"
             )
-    return [subject for name in names or available for subject in available[name]()]
+    chosen = names or [name for name in available if name != FAMILY]
+    return [subject for name in chosen for subject in available[name]()]
 
 
 def _print(subject: Subject, outcomes: Sequence[Outcome]) -> None:

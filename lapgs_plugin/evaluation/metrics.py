@@ -92,7 +92,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """
     image, target = image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)
     if mask is not None:
-        similarity = in_torch.ssim_map(torch.where(mask, image, target)[None], target[None])[0]
+        similarity = in_torch.ssim_map_torch(torch.where(mask, image, target)[None], target[None])[0]
         return float(similarity.mean(0, keepdim=True)[mask].mean())
     if image.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu

@@ -1,10 +1,10 @@
-"""CPU stand-ins for the CUDA modules that backbones import: same names, same signatures, same outputs.
+"""Stand-ins for the CUDA modules that backbones import, on a CPU and a GPU: same names, signatures and outputs.
 
     with install("fastgs"):
         import train  # an unmodified checkout's
 
 `install` puts them into `sys.modules`, where `import diff_gaussian_rasterization` finds them; importing this package
-does not. A checkout's `.cuda()` calls have to be redirected by the caller.
+does not. Where there is no GPU, a checkout's `.cuda()` calls have to be redirected by the caller.
 """
 
 from __future__ import annotations
@@ -16,17 +16,13 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-import torch
-from scipy.spatial import cKDTree
-from torch import Tensor
-
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family import fused_ssim
-from lapgs_plugin.family.variants import BACKBONES, FORKS, VARIANTS, rasterizer_module
-from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, mean_squared_distance
+from lapgs_plugin.family.neighbours import distances_and_neighbours
+from lapgs_plugin.family.variants import BACKBONES, FORKS, VARIANTS, Variant, rasterizer_module
+from lapgs_plugin.hierarchy.inheritance import mean_squared_distance
 
-__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins"]
+__all__ = ["BACKBONES", "FORKS", "VARIANTS", "install", "stand_ins", "unavailable"]
 
 
 def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType]:
@@ -39,12 +35,11 @@ def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType
     Raises:
         UserInputError: there is no such variant.
     """
-    if variant not in VARIANTS:
-        raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
+    names = variant, *_known(variant).beside
     ssim = {"fusedssim": fused_ssim.fusedssim, "fusedssim_backward": fused_ssim.fusedssim_backward}
-    knn = _distances_and_neighbours if neighbours else mean_squared_distance
+    knn = distances_and_neighbours if neighbours else mean_squared_distance
     found = {}
-    for each in (variant, *VARIANTS[variant].beside):
+    for each in names:
         name = VARIANTS[each].module
         for parent in _parents(name):
             found[parent] = _module(parent, {}, package=True)
@@ -63,18 +58,19 @@ def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType
     return found
 
 
-def _distances_and_neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `mean_squared_distance` (n,), and three neighbours of each point (n, 3) int32, the nearest first.
+def unavailable(variant: str) -> str:
+    """Return what our version of a variant's rasterizer cannot do, in words; empty if it does all.
 
-    With fewer than four points, those that do not exist are 0.
+    Raises:
+        UserInputError: there is no such variant.
     """
-    positions, count = points.detach().to("cpu", torch.float64).numpy(), min(NEIGHBOURS + 1, len(points))
-    found = cKDTree(positions).query(positions, k=range(1, count + 1))[1]  # (n, count)
-    others = found != np.arange(len(found))[:, None]
-    others[others.all(1), -1] = False  # points at the same position were found instead of the point itself
-    neighbours = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32)
-    neighbours[:, : count - 1] = torch.from_numpy(found[others].reshape(len(points), count - 1))
-    return mean_squared_distance(points), neighbours
+    return _known(variant).unavailable
+
+
+def _known(variant: str) -> Variant:
+    if variant not in VARIANTS:
+        raise UserInputError(f"stand-in for the rasterizer {variant!r}: expected one of {', '.join(VARIANTS)}")
+    return VARIANTS[variant]
 
 
 def _parents(name: str) -> list[str]:

@@ -1,15 +1,14 @@
-"""Bind the engine as graphdeco's CUDA rasterizers are bound: `forward`, argument checks, the sparse Adam."""
+"""Bind the engines as graphdeco's CUDA rasterizers are bound: `forward` and argument checks."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.call import Inputs, Settings
-from lapgs_plugin.family.cpu import mark_visible, rasterize
+from lapgs_plugin.family.engine import mark_visible, rasterize
 
 if TYPE_CHECKING:
     from lapgs_plugin.family.variants import Variant
@@ -85,7 +84,7 @@ def gather(
     rotations: Tensor | None = None,
     cov3D_precomp: Tensor | None = None,
 ) -> Inputs:
-    """Return a binding's arguments as `Inputs`, with the first SH coefficient from `dc` (n, 1, 3) if it is given.
+    """Return a binding's arguments as `Inputs`.
 
     Raises:
         UserInputError: not exactly one of SH and colours, or of scales with rotations and covariances.
@@ -97,36 +96,5 @@ def gather(
         raise UserInputError(
             "got both or neither of scales with rotations and cov3D_precomp: expected exactly one of them"
         )
-    if shs is not None and dc is not None:
-        shs = torch.cat([dc, shs], 1)
-    return Inputs(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
-
-
-class SparseGaussianAdam(torch.optim.Adam):
-    """Move only the Gaussians of the last view by Adam, without correcting the moments' bias.
-
-    A parameter group has one tensor, whose first dimension is the Gaussians. The state is that of torch.optim.Adam, but
-    'step' stays 0.
-    """
-
-    def __init__(self, params: Any, lr: float, eps: float) -> None:
-        super().__init__(params=params, lr=lr, eps=eps)
-
-    @torch.no_grad()
-    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]  # as the CUDA binding
-        """Update the rows of each parameter for which `visibility`, (n,) bool, is true; `N` is n."""
-        for group in self.param_groups:
-            (parameter,) = group["params"]
-            if parameter.grad is None:
-                continue
-            state = self.state[parameter]
-            if not state:
-                state["step"] = torch.tensor(0.0)
-                state["exp_avg"] = torch.zeros_like(parameter)
-                state["exp_avg_sq"] = torch.zeros_like(parameter)
-            rows = visibility.reshape(N).nonzero()[:, 0]
-            gradient = parameter.grad[rows]
-            mean = state["exp_avg"][rows].mul_(0.9).add_(gradient, alpha=0.1)
-            square = state["exp_avg_sq"][rows].mul_(0.999).addcmul_(gradient, gradient, value=0.001)
-            state["exp_avg"][rows], state["exp_avg_sq"][rows] = mean, square
-            parameter[rows] -= group["lr"] * mean / (square.sqrt() + group["eps"])
+    dc = None if shs is None else dc
+    return Inputs(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)

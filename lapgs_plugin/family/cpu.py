@@ -1,8 +1,4 @@
-"""Render on the CPU from the arguments of the CUDA bindings, differentiably.
-
-As in the CUDA code, a call without Gaussians gives a black image with any background, the gradient by `means2D` is in
-units of half the image's sides, and the gradient by the scales lacks the factor `scale_modifier`.
-"""
+"""Render on the CPU with the kernels of `reference_raster`."""
 
 from __future__ import annotations
 
@@ -16,17 +12,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.family.call import Inputs, Options, Output, Settings
+from lapgs_plugin.family.call import SUMS, Blending, Contributions, Inputs, Options, Output, Settings, depths_of
 from lapgs_plugin.reference_raster import pipeline
-from lapgs_plugin.reference_raster.blending import Blending
-from lapgs_plugin.reference_raster.contributions import Contributions, contributions
+from lapgs_plugin.reference_raster.blending import TiledBlending
+from lapgs_plugin.reference_raster.contributions import sums_of
 from lapgs_plugin.reference_raster.covariance import (
     antialiasing_factors,
     covariance_gradients,
     covariances_of,
     principal_axes,
 )
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, POSITION, SIGNED_COLOR_BIT
+from lapgs_plugin.reference_raster.layout import POSITION, SIGNED_COLOR_BIT
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Gradients, Rendering, View
 from lapgs_plugin.reference_raster.snug_tiles import snug_tiles
 
@@ -35,20 +31,19 @@ FOCAL_TOLERANCE = 1e-3
 
 
 def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
-    """Render differentiably by all tensors of `inputs`.
+    """Render differentiably by all tensors of `inputs`; see `engine.rasterize`.
 
     Raises:
-        UserInputError: tensors do not fit each other, or the projection does not fit the field of view.
+        UserInputError: the projection does not fit the field of view.
     """
-    _check(settings, inputs)
-    view = view_of(settings)
+    view = view_of(settings, options.blur)
     if options.antialiasing:
         covariances = inputs.covariances
         if covariances is None:
             assert inputs.scales is not None
             assert inputs.quats is not None
             covariances = covariances_of(inputs.scales * settings.scale_modifier, inputs.quats)
-        factors = antialiasing_factors(inputs.means, covariances, view)
+        factors = antialiasing_factors(inputs.means, covariances, view, options.exact_antialiasing)
         inputs = inputs._replace(opacities=inputs.opacities * factors)
     call = _Call(
         settings, view, options, torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
@@ -58,7 +53,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     return Output(image, radii, inverse_depths, centres, depths, call.contributions, call.blending)
 
 
-def view_of(settings: Settings) -> View:
+def view_of(settings: Settings, blur: float) -> View:
     """Return the camera from transposed matrices as the CUDA code takes them.
 
     Raises:
@@ -76,14 +71,9 @@ def view_of(settings: Settings) -> View:
             f"{focal[0]:.6g}, {focal[1]:.6g}; pass the transposed projection times viewmatrix for this image size"
         )
     principal = (1 + projection[0, 2]) * width / 2, (1 + projection[1, 2]) * height / 2
-    view = pipeline.make_view(width, height, world_to_camera.astype(np.float32), focal, principal)
+    view = pipeline.make_view(width, height, world_to_camera.astype(np.float32), focal, principal, blur)
     view.camera[POSITION : POSITION + 3] = settings.campos.detach().cpu().numpy().ravel()
     return view
-
-
-def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
-    """Return which points (n, 3) are in front of the near plane, (n,) bool; the CUDA code tests no more."""
-    return depths_of(positions.detach(), settings.viewmatrix) > NEAR_DEPTH
 
 
 class _Call:
@@ -98,6 +88,7 @@ class _Call:
     def gaussians(self, tensors: Sequence[Tensor | None]) -> Gaussians:
         """Return the tensors of `Inputs` as the kernels take them."""
         given = Inputs._make(None if t is None else t.detach().contiguous() for t in tensors)
+        sh = given.sh if given.dc is None or given.sh is None else torch.cat([given.dc, given.sh], 1)
         scales, quats = given.scales, given.quats
         if given.covariances is not None:
             scales, quats = principal_axes(given.covariances)
@@ -108,7 +99,7 @@ class _Call:
         degree = int(self.settings.sh_degree)
         return Gaussians(
             given.means.numpy(), quats.numpy(), scales.numpy(), given.opacities.reshape(-1).numpy(),
-            None if given.sh is None else given.sh.numpy(), None if given.colors is None else given.colors.numpy(),
+            None if sh is None else sh.numpy(), None if given.colors is None else given.colors.numpy(),
             raw=False, signed=degree < 0, sh_degree=degree & ~SIGNED_COLOR_BIT,
         )  # fmt: skip
 
@@ -128,15 +119,47 @@ class _Call:
         return replace(gaussians, sh=None, colors=colors)
 
 
+def _contributions(call: _Call, rendering: Rendering) -> Contributions:
+    """Return the sums that the options ask for."""
+    assert rendering.kept is not None
+    weights = call.options.pixel_weights
+    pixels = call.view.width * call.view.height
+    flat = torch.ones(pixels) if weights is None else weights.detach().to("cpu", torch.float32).reshape(-1)
+    sums = sums_of(len(rendering.radii), call.view, rendering.kept, flat.contiguous().numpy())
+    found = {name: torch.from_numpy(values).float() for name, values in zip(SUMS, sums, strict=True)}
+    found["counts"] = found["counts"].int()
+    return Contributions(**{name: found[name] for name in call.options.sums})
+
+
+class _Blending(Blending):
+    """Answer in tensors what `TiledBlending` computes in NumPy."""
+
+    def __init__(self, tiled: TiledBlending) -> None:
+        self._tiled, self.n = tiled, tiled.n
+
+    @property
+    def transmittance(self) -> Tensor:
+        return torch.from_numpy(self._tiled.rendering.transmittance)
+
+    def leaders(self, ranks: int = 1) -> Tensor:
+        return torch.from_numpy(self._tiled.leaders(ranks))
+
+    def weighted_shares(self, weights: Tensor) -> Tensor:
+        return torch.from_numpy(self._tiled.weighted_shares(weights.detach().numpy())).float()
+
+    def squared_gradients(self, grad_image: Tensor) -> Tensor:
+        return torch.from_numpy(self._tiled.squared_gradients(grad_image.detach().numpy())).float()
+
+
 class _Rasterize(torch.autograd.Function):
     """Map (call, *tensors of Inputs) to image, inverse depths (empty if not asked for), radii, centres, depths."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         gaussians = call.gaussians(tensors)
-        weights = call.options.pixel_weights
+        options = call.options
         n = len(gaussians.means)
-        keep = call.keep or weights is not None or call.options.blending
+        keep = call.keep or bool(options.sums) or options.blending
         rendering = call.render(gaussians, call.background, keep)
         image, radii, centres = (
             torch.from_numpy(array) for array in (rendering.image, rendering.radii, rendering.centres)
@@ -145,14 +168,12 @@ class _Rasterize(torch.autograd.Function):
             image = torch.zeros_like(image)
         depths = depths_of(torch.from_numpy(gaussians.means), call.settings.viewmatrix)
         depths = torch.where(radii > 0, depths, 0.0)
-        if weights is not None:
-            assert rendering.kept is not None
-            flat = weights.detach().to("cpu", torch.float32).contiguous().reshape(-1).numpy()
-            call.contributions = contributions(n, call.view, rendering.kept, flat)
-        if call.options.blending:
-            call.blending = Blending(call.view, rendering)
+        if options.sums:
+            call.contributions = _contributions(call, rendering)
+        if options.blending:
+            call.blending = _Blending(TiledBlending(call.view, rendering))
         inverse_depths = torch.empty(0)
-        if call.options.inverse_depth:
+        if options.inverse_depth:
             behind = call.render(call.shaded_by_depth(gaussians), np.zeros(3, np.float32), False)
             inverse_depths = torch.from_numpy(behind.image[:1].copy())
         if call.keep:
@@ -176,7 +197,7 @@ class _Rasterize(torch.autograd.Function):
             rendering = call.render(shaded, np.zeros(3, np.float32), True)
             grad = torch.cat([grad_depth, torch.zeros(2, *grad_depth.shape[1:])])
             found = _gradients(call, tensors, shaded, rendering, grad)
-            by_inverse, found[3], found[4] = found[4], None, None
+            by_inverse, found[3:6] = found[5], [None, None, None]
             assert by_inverse is not None
             assert found[0] is not None
             axis = call.settings.viewmatrix.detach().cpu()[:3, 2]
@@ -195,11 +216,14 @@ def _gradients(
     if given.covariances is not None:
         assert rendering.kept is not None
         by_covariances = covariance_gradients(given.means, given.covariances, call.view, rendering.kept, found.slots)
+    by_sh = None if found.sh is None else torch.from_numpy(found.sh)
+    by_dc = None if by_sh is None or given.dc is None else by_sh[:, :1]
     return [
         torch.from_numpy(found.means),
         _screen_gradient(call.view, found, given.means2d),
         torch.from_numpy(found.opacities)[:, None],
-        None if found.sh is None else torch.from_numpy(found.sh),
+        by_dc,
+        by_sh if by_sh is None or by_dc is None else by_sh[:, 1:],
         None if found.colors is None else torch.from_numpy(found.colors),
         None if given.covariances is not None else torch.from_numpy(found.scales),
         None if given.covariances is not None else torch.from_numpy(found.quats),
@@ -219,42 +243,3 @@ def _screen_gradient(view: View, found: Gradients, means2d: Tensor) -> Tensor:
 
 def _add(a: list[Tensor | None], b: list[Tensor | None]) -> list[Tensor | None]:
     return [y if x is None else x if y is None else x + y for x, y in zip(a, b, strict=True)]
-
-
-def depths_of(means: Tensor, viewmatrix: Tensor) -> Tensor:
-    """Return camera-space z, (n,)."""
-    matrix = viewmatrix.detach().to("cpu", torch.float32)
-    return means @ matrix[:3, 2] + matrix[3, 2]
-
-
-def _check(settings: Settings, inputs: Inputs) -> None:
-    """Refuse tensors that CUDA code would read out of bounds."""
-    n = len(inputs.means)
-    wanted = {
-        "means3D": (inputs.means, (n, 3)),
-        "opacities": (inputs.opacities, (n, 1)),
-        "colors_precomp": (inputs.colors, (n, 3)),
-        "scales": (inputs.scales, (n, 3)),
-        "rotations": (inputs.quats, (n, 4)),
-        "cov3D_precomp": (inputs.covariances, (n, 6)),
-    }
-    for name, (tensor, shape) in wanted.items():
-        if tensor is not None and (
-            tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu"
-        ):
-            raise UserInputError(
-                f"{name} is {tuple(tensor.shape)}, {tensor.dtype}, on {tensor.device}: "
-                f"expected {shape}, torch.float32, on the CPU"
-            )
-    degree = int(settings.sh_degree) & ~SIGNED_COLOR_BIT
-    if inputs.sh is not None and not (
-        0 <= degree <= 3
-        and inputs.sh.shape[:1] == (n,)
-        and inputs.sh.shape[2:] == (3,)
-        and inputs.sh.shape[1] in (1, 4, 9, 16)
-        and inputs.sh.shape[1] >= (degree + 1) ** 2
-    ):
-        raise UserInputError(
-            f"SH coefficients are {tuple(inputs.sh.shape)} at sh_degree {degree}: expected ({n}, k, 3), k of 1, 4, 9 "
-            "or 16 and at least (degree + 1)^2, dc included"
-        )

@@ -5,8 +5,8 @@ Each class is the `GaussianRasterizer` of a variant; see `variants.Variant.bindi
 
 from __future__ import annotations
 
-import logging
 import math
+from collections import deque
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -18,17 +18,15 @@ from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
-from lapgs_plugin.family.call import Inputs, Options, Output
-from lapgs_plugin.family.cpu import depths_of, rasterize
-from lapgs_plugin.reference_raster.blending import Blending
+from lapgs_plugin.family.call import Blending, Inputs, Options, Output, depths_of
+from lapgs_plugin.family.engine import rasterize
 from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
-from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
-
-logger = logging.getLogger(__name__)
 
 THIN = 1e-4
 """Third standard deviation of a surfel, over its larger one."""
+SHARES = Options(sums=("counts", "blending"), blending=True)
+"""Ask for each Gaussian's pixels and shares, and how each pixel is blended."""
 
 
 class SpeedySplat(Rasterizer):
@@ -51,7 +49,7 @@ class SpeedySplat(Rasterizer):
         image = output.image
         if output.blending is not None:
             image = _Scored.apply(image, scores, output.blending)  # type: ignore[no-untyped-call]  # torch's
-        return image, output.radii, torch.zeros(1)
+        return image, output.radii, image.new_zeros(1)
 
 
 class _Scored(torch.autograd.Function):
@@ -65,8 +63,8 @@ class _Scored(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor | None, ...]:
-        found = ctx.blending.squared_gradients(grad_image.reshape(3, -1).numpy())
-        return grad_image, torch.from_numpy(found).float()[:, None], None
+        found: Tensor = ctx.blending.squared_gradients(grad_image.reshape(3, -1))
+        return grad_image, found[:, None], None
 
 
 class MiniSplatting(WholeSh):
@@ -103,7 +101,7 @@ class MiniSplatting2(MiniSplatting):
         opacities = torch.where(culling[:, None], 0.0, opacities)
         inputs = gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
         output = rasterize(self.raster_settings, inputs, Options(blending=flag_max_count))
-        leads = torch.zeros(len(means3D)) if output.blending is None else _pixels_led(output.blending)
+        leads = means3D.new_zeros(len(means3D)) if output.blending is None else _pixels_led(output.blending)
         return output.image, torch.where(culling, 0, output.radii), leads
 
     def render_simp(
@@ -111,8 +109,7 @@ class MiniSplatting2(MiniSplatting):
     ) -> tuple[Tensor, ...]:
         """Return what Mini-Splatting's `forward` returns."""
         inputs = gather(means3D, means2D, torch.where(culling[:, None], 0.0, opacities), **more)
-        settings = self.raster_settings
-        return with_shares(settings, rasterize(settings, inputs, summing(settings, blending=True)))
+        return with_shares(self.raster_settings, rasterize(self.raster_settings, inputs, SHARES))
 
     def render_depth(  # type: ignore[override]  # as the CUDA binding
         self, means3D: Tensor, means2D: Tensor, opacities: Tensor, culling: Tensor, **more: Tensor | None
@@ -120,24 +117,25 @@ class MiniSplatting2(MiniSplatting):
         return super().render_depth(means3D, means2D, torch.where(culling[:, None], 0.0, opacities), **more)
 
 
-def summing(settings: Any, blending: bool = False) -> Options:
-    """Ask for sums over all pixels."""
-    return Options(pixel_weights=torch.ones(settings.image_height * settings.image_width), blending=blending)
-
-
 def with_shares(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return image, radii, and each Gaussian's shares, pixels, and pixels that it has the largest share of."""
-    sums, blending = output.contributions, output.blending
-    assert sums is not None
-    assert blending is not None
-    shares, counts = torch.from_numpy(sums.blending).float(), torch.from_numpy(sums.counts)
-    return output.image, output.radii, shares, counts, _pixels_led(blending)
+    assert output.blending is not None
+    return output.image, output.radii, output.sum("blending"), output.sum("counts"), _pixels_led(output.blending)
 
 
 def _pixels_led(blending: Blending) -> Tensor:
     """Return the number of pixels that each Gaussian has the largest share of, (n,) float32."""
-    (leaders,) = torch.from_numpy(blending.leaders())
-    return torch.bincount(leaders[leaders >= 0], minlength=blending.n).float()
+    return _times_named(blending.leaders(), blending.n)
+
+
+def _times_named(indices: Tensor, n: int) -> Tensor:
+    """Return how often each of the numbers 0 to n - 1 is among int64 ones, (n,) float32; -1 is left out.
+
+    A GPU is not waited for, as `bincount` and selections by a mask would.
+    """
+    flat = indices.reshape(-1)
+    counts = torch.zeros(n + 1, device=flat.device)
+    return counts.index_add_(0, flat + 1, torch.ones_like(flat, dtype=torch.float32))[1:]
 
 
 @torch.no_grad()
@@ -147,8 +145,9 @@ def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
     assert output.blending is not None
     assert inputs.scales is not None, "render_depth takes scales and rotations"
     assert inputs.quats is not None
-    (leaders,) = torch.from_numpy(output.blending.leaders())
-    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    (leaders,) = output.blending.leaders()
+    rows, columns = (torch.arange(size, device=leaders.device) for size in (height, width))
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
     across = ((2 * column + 1) / width - 1) * settings.tanfovx
     down = ((2 * row + 1) / height - 1) * settings.tanfovy
     in_camera = torch.stack([across, down, torch.ones_like(across)], -1).reshape(-1, 3)
@@ -171,30 +170,40 @@ def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
         "rendered_depth": depth.reshape(shape),
         "discriminants": torch.where(leaders >= 0, b * b - 4 * a * c, 0.0).reshape(shape),
         "gidx": at.int().reshape(shape),
-        "accum_alpha": torch.from_numpy(output.blending.rendering.transmittance).reshape(shape),
+        "accum_alpha": output.blending.transmittance.reshape(shape),
     }
 
 
 class MipSplatting(WholeSh):
-    """Render with antialiasing; the third column of the gradient by `means2D` sums absolute values.
-
-    DEPARTURE: the image is blurred by 0.3 px^2 instead of `kernel_size`.
-    """
+    """Render with antialiasing; the third column of the gradient by `means2D` sums absolute values."""
 
     def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
-        settings = self.raster_settings
-        if bool((settings.subpixel_offset != 0).any()):
-            raise UserInputError(
-                "the CPU stand-in of Mip-Splatting's rasterizer has no subpixel_offset, expected all zeros; leave out "
-                "--ray_jitter, or train on a GPU"
-            )
-        if settings.kernel_size != PIXEL_VARIANCE:
-            _warn_once(
-                f"the CPU stand-in of Mip-Splatting's rasterizer takes kernel_size {PIXEL_VARIANCE}, "
-                f"not {settings.kernel_size}"
-            )
+        _require_no_offset(self.raster_settings)
         four = _Padded.apply(inputs.means2d)  # type: ignore[no-untyped-call]  # torch's
         return super()._render(inputs._replace(means2d=four))
+
+
+_arriving: deque[tuple[Any, Tensor]] = deque()
+"""Flags of calls on a GPU, on their way to the processor."""
+
+
+def _require_no_offset(settings: Any) -> None:
+    """Refuse pixels that are moved; on a GPU a few calls later, because asking it at once would wait for it."""
+    moved = (settings.subpixel_offset != 0).any()
+    if moved.is_cuda:
+        flag = torch.empty((), dtype=torch.bool, pin_memory=True)
+        event: Any = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
+        flag.copy_(moved, non_blocking=True)
+        event.record()
+        _arriving.append((event, flag))
+        moved = torch.zeros((), dtype=torch.bool)
+        while _arriving and _arriving[0][0].query():
+            moved |= _arriving.popleft()[1]
+    if bool(moved):
+        raise UserInputError(
+            "our version of Mip-Splatting's rasterizer has no subpixel_offset, expected all zeros; leave out "
+            "--ray_jitter, or train with its own CUDA extension"
+        )
 
 
 class _Padded(torch.autograd.Function):
@@ -221,11 +230,6 @@ class PixelGS(WholeSh):
             factors = (depths / settings.depth_threshold).square().clamp(max=1)[:, None]
             points = points * factors + (points * (1 - factors)).detach()
         return super()._render(inputs._replace(means2d=points))
-
-
-@lru_cache
-def _warn_once(line: str) -> None:
-    logger.warning("%s", line)
 
 
 class EfficientGS(Rasterizer):
@@ -258,27 +262,23 @@ class EfficientGS(Rasterizer):
     ) -> tuple[Tensor, ...]:
         if extract_gs_info or reg_loss_k >= 0 or extract_gs_rays_num or max_gs_num > 0 or gs_radius != 3:
             raise UserInputError(
-                "the CPU stand-in of EfficientGS's rasterizer has no regularisation, rays or other radius; leave these "
-                "options out, or train on a GPU"
+                "our version of EfficientGS's rasterizer has no regularisation, rays or other radius; leave these "
+                "options out, or train with its own CUDA extension"
             )
         settings = self.raster_settings
         if settings.use_train_speedup:
-            raise UserInputError(
-                "the CPU stand-in of EfficientGS's rasterizer has no --use_train_speedup; leave it out"
-            )
+            raise UserInputError("our version of EfficientGS's rasterizer has no --use_train_speedup; leave it out")
         if shs is not None and sparse_shs_degree is not None and len(sparse_shs_degree):
-            degrees = torch.arange(shs.shape[1]).sqrt().floor()  # of each coefficient
+            degrees = torch.arange(shs.shape[1], device=shs.device).sqrt().floor()  # of each coefficient
             shs = shs * (degrees <= sparse_shs_degree[:, None])[:, :, None]
         inputs = gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)
         output = rasterize(settings, inputs, Options(blending=top_k > 0 or pix_loss is not None))
-        n, empty = len(means3D), torch.empty(0)
-        largest, losses = torch.zeros(n, dtype=torch.int32), empty
+        empty = means3D.new_empty(0)
+        largest, losses = torch.zeros_like(output.radii), empty
         if output.blending is not None and top_k > 0:
-            found = torch.from_numpy(output.blending.leaders(top_k))
-            largest[found[found >= 0]] = 1
+            largest = (_times_named(output.blending.leaders(top_k), len(means3D)) > 0).int()
         if output.blending is not None and pix_loss is not None:
-            total = pix_loss.detach().sum(0).reshape(-1).numpy()
-            losses = torch.from_numpy(output.blending.weighted_shares(total)).float()
+            losses = output.blending.weighted_shares(pix_loss.detach().sum(0).reshape(-1))
         image = output.image.permute(1, 2, 0) if settings.use_hwc else output.image
         return image, output.radii, largest, empty, empty, losses, empty, empty
 
@@ -303,8 +303,8 @@ class Surfels(WholeSh):
         centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
         depths = centres[:, 2]
         normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
-        black = settings._replace(bg=torch.zeros(3))
-        unshaded = inputs._replace(sh=None, means2d=torch.zeros_like(inputs.means2d))
+        black = settings._replace(bg=torch.zeros_like(settings.bg))
+        unshaded = inputs._replace(dc=None, sh=None, means2d=torch.zeros_like(inputs.means2d))
         blended = [
             rasterize(black, unshaded._replace(colors=colors), Options())
             for colors in (torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1), normals)
@@ -327,10 +327,10 @@ def compute_relocation(
     coefficients.
     """
     new = 1 - (1 - opacity) ** (1 / copies)
-    powers = torch.arange(n_max)
+    powers = torch.arange(n_max, device=opacity.device)
     signs = (-1.0) ** powers / (powers + 1.0).sqrt()
     terms = signs * new.reshape(-1, 1) ** (powers + 1)  # (n, n_max) by k
-    sums = terms @ binoms.cpu().T  # (n, n_max) by i - 1; binoms[i, k] is 0 for k > i
+    sums = terms @ binoms.T  # (n, n_max) by i - 1; binoms[i, k] is 0 for k > i
     total = (sums * (powers < copies.reshape(-1, 1))).sum(1).reshape(opacity.shape)
     return new, (opacity / total).reshape(-1, 1) * scale
 
@@ -372,12 +372,15 @@ def diff_rasterize(
     """
     given = rasterizer_settings
     tan_x, tan_y = given.width / (2 * given.focal_x), given.height / (2 * given.focal_y)
-    projection = torch.zeros(4, 4)
-    projection[0, 0], projection[1, 1], projection[3, 2] = 1 / tan_x, 1 / tan_y, 1
-    projection[0, 2] = 2 * given.center_x / given.width - 1
-    projection[1, 2] = 2 * given.center_y / given.height - 1
-    projection[2, 2], projection[2, 3] = 1, -given.near_plane
-    pose = given.w2c if len(given.w2c) == 4 else torch.cat([given.w2c, torch.tensor([[0.0, 0, 0, 1]])])
+    projection = _matrix(
+        means.device,
+        (1 / tan_x, 0.0, 2 * given.center_x / given.width - 1, 0.0),
+        (0.0, 1 / tan_y, 2 * given.center_y / given.height - 1, 0.0),
+        (0.0, 0.0, 1.0, -given.near_plane),
+        (0.0, 0.0, 1.0, 0.0),
+    )
+    last = _matrix(means.device, (0.0, 0.0, 0.0, 1.0))
+    pose = given.w2c if len(given.w2c) == 4 else torch.cat([given.w2c, last])
     settings: Any = SimpleNamespace(
         image_height=given.height, image_width=given.width, tanfovx=tan_x, tanfovy=tan_y, bg=given.bg_color,
         scale_modifier=1.0, viewmatrix=pose.T, projmatrix=(projection @ pose).T,
@@ -385,8 +388,8 @@ def diff_rasterize(
     )  # fmt: skip
     points = torch.zeros_like(means, requires_grad=True)
     inputs = Inputs(
-        means, points, opacities.sigmoid(), torch.cat([sh_coefficients_0, sh_coefficients_rest], 1), None,
-        scales.exp(), normalize(rotations), None,
+        means, points, opacities.sigmoid(), sh_coefficients_0, sh_coefficients_rest, None, scales.exp(),
+        normalize(rotations), None,
     )  # fmt: skip
     output = rasterize(settings, inputs, Options(antialiasing=given.proper_antialiasing))
 
@@ -398,6 +401,12 @@ def diff_rasterize(
     if points.requires_grad and output.image.requires_grad:
         points.register_hook(note)  # type: ignore[no-untyped-call]  # torch's
     return output.image
+
+
+@lru_cache(maxsize=64)
+def _matrix(device: torch.device, *rows: tuple[float, ...]) -> Tensor:
+    """Return a matrix on a device, copied there once: a GPU is waited for at every copy."""
+    return torch.tensor(rows, device=device)
 
 
 class FusedAdam(torch.optim.Adam):

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
-from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_map
+from lapgs_plugin.ops.photometric_loss import ssim_map, triton_works
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS
 
 __all__ = ["fused_ssim", "fused_ssim_", "fusedssim", "fusedssim_backward"]
 
@@ -22,7 +22,15 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     first, second = _prepared(img1, img2, padding, train)
     if padding == "valid":
         return _cropped(ssim_map(first, second), padding).mean()
-    return 1 - photometric_loss_cpu(first, second, 1.0)
+    if first.device.type == "cpu":
+        from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
+
+        return 1 - photometric_loss_cpu(first, second, 1.0)
+    if first.shape[1] == 3 and triton_works(first, second):
+        from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
+
+        return 1 - photometric_loss_triton(first, second, 1.0)
+    return ssim_map(first, second).mean()
 
 
 def fused_ssim_(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:

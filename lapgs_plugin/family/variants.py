@@ -1,4 +1,4 @@
-"""List the CUDA rasterizers that have a stand-in: the settings that each takes and the tensors that it returns.
+"""List the rasterizers of the 3DGS family: the settings that each takes and the tensors that it returns.
 
 Matrices are transposed, as in the CUDA bindings. Settings beside those of the view:
 
@@ -19,15 +19,15 @@ from __future__ import annotations
 from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.family import forks
-from lapgs_plugin.family.binding import DcApart, Rasterizer, SparseGaussianAdam, WholeSh
-from lapgs_plugin.family.call import Options, Output
+from lapgs_plugin.family.binding import DcApart, Rasterizer, WholeSh
+from lapgs_plugin.family.call import SUMS, Options, Output
+from lapgs_plugin.family.sparse_adam import SparseGaussianAdam
 
 _VIEW = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
@@ -63,6 +63,8 @@ class Variant:
         functions: other functions and classes of its module.
         beside: variants of other modules that the same checkouts import.
         needs_logs: whether these checkouts cannot do without TensorBoard.
+        unavailable: what ours cannot do, in words; empty if it does all that the CUDA module does.
+        renders_gaussians: whether its image is that of the Gaussians that it is given.
     """
 
     description: str
@@ -77,6 +79,8 @@ class Variant:
     functions: tuple[Any, ...] = ()
     beside: tuple[str, ...] = ()
     needs_logs: bool = False
+    unavailable: str = ""
+    renders_gaussians: bool = True
 
 
 def _with_inverse_depths(settings: Any, output: Output) -> tuple[Tensor, ...]:
@@ -90,9 +94,7 @@ def _with_marked_pixels(settings: Any, output: Output) -> tuple[Tensor, ...]:
 
     Without the flag the last tensor is empty.
     """
-    counts = torch.empty(0, dtype=torch.int32)
-    if output.contributions is not None:
-        counts = torch.from_numpy(output.contributions.weights).int()
+    counts = output.radii.new_empty(0) if output.contributions is None else output.sum("weights").int()
     return output.image, output.radii, counts
 
 
@@ -105,34 +107,30 @@ def _with_sums(settings: Any, output: Output) -> tuple[Tensor, ...]:
     fewer rows these are four empty tensors.
     """
     size = settings.image_height, settings.image_width
-    counts = torch.zeros(size if _weight_rows(settings) else 0, dtype=torch.int32)
-    lists = torch.empty(0, dtype=torch.int32), torch.empty(0), torch.empty(0)
-    sums = torch.empty(0), torch.empty(0, dtype=torch.int32), torch.empty(0), torch.empty(0)
+    empty, whole = output.image.new_empty(0), output.radii.new_empty(0)
+    counts = output.radii.new_zeros(size) if _weight_rows(settings) else whole
+    sums: tuple[Tensor, ...] = empty, whole, empty, empty
     if output.contributions is not None:
-        found = output.contributions
-        sums = (
-            torch.from_numpy(found.weights).float(), torch.from_numpy(found.counts),
-            torch.from_numpy(found.blending).float(), torch.from_numpy(found.distances).float(),
-        )  # fmt: skip
-    return output.image, output.radii, counts, *lists, output.centres, output.depths, output.radii.clone(), *sums
+        sums = tuple(output.sum(name) for name in SUMS)
+    return (
+        output.image, output.radii, counts, whole, empty, empty, output.centres, output.depths, output.radii.clone(),
+        *sums,
+    )  # fmt: skip
 
 
 def _with_total_share(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and the sum of each Gaussian's shares (n,)."""
-    assert output.contributions is not None
-    return output.image, output.radii, torch.from_numpy(output.contributions.blending).float()
+    return output.image, output.radii, output.sum("blending")
 
 
 def _with_blended(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and whether each Gaussian is blended in some pixel, (n,) int32."""
-    assert output.contributions is not None
-    return output.image, output.radii, (torch.from_numpy(output.contributions.counts) > 0).int()
+    return output.image, output.radii, (output.sum("counts") > 0).int()
 
 
 def _with_pixels(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """Return the image, the radii, and the number of pixels in which each Gaussian is blended, (n, 1) float32."""
-    assert output.contributions is not None
-    return output.image, output.radii, torch.from_numpy(output.contributions.counts).float()[:, None]
+    return output.image, output.radii, output.sum("counts").float()[:, None]
 
 
 def _weight_rows(settings: Any) -> int:
@@ -162,7 +160,9 @@ BACKBONES = {
         "Stand in for the rasterizer of Taming-3DGS, branch main: with the sums that Gaussians are scored by.",
         (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
-        options=lambda settings: Options(pixel_weights=settings.pixel_weights if _weight_rows(settings) > 1 else None),
+        options=lambda settings: (
+            Options(sums=SUMS, pixel_weights=settings.pixel_weights) if _weight_rows(settings) > 1 else Options()
+        ),
         outputs=_with_sums,
         binding=DcApart,
         sparse_adam=True,
@@ -177,8 +177,10 @@ BACKBONES = {
     "fastgs": Variant(
         "Stand in for the rasterizer of FastGS: with the compact box and the count of marked pixels.",
         (*_VIEW, "mult", "prefiltered", "debug", "get_flag", "metric_map"),
-        options=lambda settings: Options(
-            mult=settings.mult, pixel_weights=(settings.metric_map == 1).float() if settings.get_flag else None
+        options=lambda settings: (
+            Options(mult=settings.mult, sums=("weights",), pixel_weights=(settings.metric_map == 1).float())
+            if settings.get_flag
+            else Options(mult=settings.mult)
         ),
         outputs=_with_marked_pixels,
         module="diff_gaussian_rasterization_fastgs",
@@ -190,7 +192,7 @@ BACKBONES = {
 
 _MINI_SPLATTING = Variant(
     "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
-    options=partial(forks.summing, blending=True),
+    options=lambda settings: forks.SHARES,
     outputs=forks.with_shares,
     module="diff_gaussian_rasterization_ms",
     binding=forks.MiniSplatting,
@@ -210,33 +212,35 @@ FORKS = {
     ),
     "3dgs-mcmc": Variant(
         "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",
-        options=forks.summing,
+        options=lambda settings: Options(sums=("counts",)),
         outputs=_with_blended,
         functions=(forks.compute_relocation,),
     ),
     "absgs": Variant(
         "Stand in for the rasterizer of AbsGS: with absolute gradients and the sum of shares.",
-        options=forks.summing,
+        options=lambda settings: Options(sums=("blending",)),
         outputs=_with_total_share,
         module="diff_gaussian_rasterization_abs",
     ),
     "mip-splatting": Variant(
-        "Stand in for the rasterizer of Mip-Splatting: with antialiasing of 0.3 px^2.",
+        "Stand in for the rasterizer of Mip-Splatting: with antialiasing, of any variance.",
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
-        options=lambda settings: Options(antialiasing=True),
+        options=lambda settings: Options(antialiasing=True, exact_antialiasing=True, blur=settings.kernel_size),
         returned=2,
         binding=forks.MipSplatting,
+        unavailable="pixels that are moved by subpixel_offset (--ray_jitter)",
     ),
     "efficientgs": Variant(
         "Stand in for the rasterizer of EfficientGS: with the largest shares, and SH degrees of each Gaussian.",
         (*_FAMILY, "use_train_speedup", "ignored_rate", "lambda_dssim", "use_hwc"),
         binding=forks.EfficientGS,
         needs_logs=True,
+        unavailable="regularisation, counts of rays, radii other than three sigma, --use_train_speedup",
     ),
     "pixel-gs": Variant(
         "Stand in for the rasterizer of Pixel-GS: with the pixels of each Gaussian, and gradients scaled by depth.",
         (*_VIEW[:6], "depth_threshold", *_VIEW[6:], "prefiltered", "debug"),
-        options=forks.summing,
+        options=lambda settings: Options(sums=("counts",)),
         outputs=_with_pixels,
         binding=forks.PixelGS,
     ),
@@ -244,6 +248,8 @@ FORKS = {
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",
         module="diff_surfel_rasterization",
         binding=forks.Surfels,
+        renders_gaussians=False,
+        unavailable="intersections of rays with surfels, median depths, distortion; it renders very flat Gaussians",
     ),
     "faster-gs": Variant(
         "Stand in for the rasterizer of Faster-GS: a function of raw parameters, and its Adam.",

@@ -45,6 +45,11 @@ class Semantics:
     Attributes:
         three_sigma_cut: False if a Gaussian is blended wherever alpha reaches 1/255, also beyond three sigma; one that
             is blended in no pixel may then have radius 0.
+        mult: factor on the squared distance at which alpha reaches 1/255, if a Gaussian is blended in the tiles that
+            this ellipse meets; None for all tiles, or those of the three-sigma cut.
+        antialiasing: True if Gaussians that are smaller than a pixel are dimmed.
+        exact_antialiasing: True if that is as in Mip-Splatting, without lower bound and with its own gradient.
+        blur: variance that is added to 2D covariances, in px^2.
         expanded_conic_gradient: True if the backward pass turns the gradient by the inverse 2D covariance into that by
             the covariance with matrix products. In float32 that loses the gradients of Gaussians that are very long on
             screen; see `evaluation.conformance.EXPANDED_CONIC`.
@@ -55,6 +60,10 @@ class Semantics:
     """
 
     three_sigma_cut: bool = True
+    mult: float | None = None
+    antialiasing: bool = False
+    exact_antialiasing: bool = False
+    blur: float = 0.3
     expanded_conic_gradient: bool = False
     rebuilt_transmittance: bool = False
     departures: Mapping[str, str] = field(default_factory=dict)

@@ -56,7 +56,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Blending:
+class TiledBlending:
     """Hold a rendering of n Gaussians that was made with `keep`, and its tiles."""
 
     view: View

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,36 +40,22 @@ from lapgs_plugin.reference_raster.pipeline import Kept, View, offsets
 from lapgs_plugin.reference_raster.tile_kernels import FINAL, falloff, pixels_x, pixels_y
 
 
-@dataclass(frozen=True)
-class Contributions:
-    """Hold sums over the pixels in which each Gaussian is blended.
-
-    Attributes:
-        weights: (n,) float64 of the pixels' weights.
-        counts: (n,) int32 of 1.
-        blending: (n,) float64 of transmittance times alpha, the Gaussian's share of the pixel.
-        distances: (n,) float64 of the distance of the pixel from the projected centre, in pixels.
-    """
-
-    weights: NDArray[np.float64]
-    counts: NDArray[np.int32]
-    blending: NDArray[np.float64]
-    distances: NDArray[np.float64]
-
-
-def contributions(n: int, view: View, kept: Kept, weights: Floats) -> Contributions:
+def sums_of(n: int, view: View, kept: Kept, weights: Floats) -> tuple[NDArray[np.float64], ...]:
     """Sum over the pixels of an image that `pipeline.render` made of n Gaussians with `keep`.
 
     Args:
         weights: (height * width,) float32 weight of each pixel.
+
+    Returns:
+        (n,) each: sums over the pixels in which a Gaussian is blended of their weights, of 1, of transmittance times
+        alpha, of the distance from the projected centre in pixels.
     """
     slots = empty(len(kept.members) * SLOT, np.float32)
     parallel(
         _accumulate, view.width, view.height, view.tiles[0], kept.tile_start, kept.members, kept.splats,
         offsets(np.dtype(np.float32)), kept.hits, kept.reached, kept.final, weights, slots,
     )  # fmt: skip
-    sums = [np.bincount(kept.members, slots[column::SLOT], n).astype(np.float64) for column in range(4)]
-    return Contributions(sums[0], sums[1].astype(np.int32), sums[2], sums[3])
+    return tuple(np.bincount(kept.members, slots[column::SLOT], n).astype(np.float64) for column in range(4))
 
 
 @jit

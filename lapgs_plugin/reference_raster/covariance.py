@@ -15,14 +15,15 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.jit.lanes import Floats
 from lapgs_plugin.reference_raster.layout import (
+    BLUR,
     FACTOR_SCALE,
     FACTOR_XX,
     FACTOR_XY,
     FACTOR_YY,
     FOCAL_X,
     FOCAL_Y,
+    MIN_SHARE,
     NEAR_DEPTH,
-    PIXEL_VARIANCE,
     ROTATION,
     SLOT,
     SPLAT,
@@ -30,12 +31,10 @@ from lapgs_plugin.reference_raster.layout import (
     SUM_UV,
     SUM_VV,
     TRANSLATION,
+    VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
 from lapgs_plugin.reference_raster.pipeline import Kept, View
-
-MIN_SHARE = 2.5e-5
-"""Lower bound, in antialiasing, of the determinant without the 0.3 px^2 over that with it."""
 
 
 def matrices(covariances: Tensor) -> Tensor:
@@ -62,7 +61,7 @@ def covariances_of(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """Return entries xx, xy, yy (n, 3) of the 2D covariances in px^2, without the 0.3 px^2.
+    """Return entries xx, xy, yy (n, 3) of the 2D covariances in px^2, without the blur.
 
     Behind the camera they have no meaning.
 
@@ -81,39 +80,55 @@ def screen_covariances(means: Tensor, covariances: Tensor, view: View) -> Tensor
 
 
 class _Antialiasing(torch.autograd.Function):
-    """Map 2D covariances (n, 3) without the 0.3 px^2 to factors (n,) on the opacities."""
+    """Map 2D covariances (n, 3) without the blur, and its variance, to factors (n,) on the opacities."""
 
     @staticmethod
-    def forward(ctx: Any, covariances: Tensor) -> Tensor:
+    def forward(ctx: Any, covariances: Tensor, blur: float) -> Tensor:
         xx, xy, yy = covariances.unbind(1)
-        wide = covariances + covariances.new_tensor([PIXEL_VARIANCE, 0, PIXEL_VARIANCE])
+        wide = covariances + covariances.new_tensor([blur, 0, blur])
         share = (xx * yy - xy * xy) / (wide[:, 0] * wide[:, 2] - xy * xy)
         factors = share.clamp_min(MIN_SHARE).sqrt()
         ctx.save_for_backward(wide, share, factors)
+        ctx.blur = blur
         return factors
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_factors: Tensor) -> Tensor:
+    def backward(ctx: Any, grad_factors: Tensor) -> tuple[Tensor, None]:
         wide, share, factors = ctx.saved_tensors
         x, z, y = wide.unbind(1)
-        w = PIXEL_VARIANCE
-        # DEPARTURE: the CUDA code differentiates the share at covariances that already have the 0.3 px^2, and not at
-        # those that the share is computed from.
+        w = ctx.blur
+        # DEPARTURE: the CUDA code differentiates the share at covariances that already have the blur, and not at those
+        # that the share is computed from.
         d_share = torch.where(share <= MIN_SHARE, 0.0, grad_factors / (2 * factors))
         common = w * d_share / ((x + w) * (y + w) - z * z) ** 2
         return torch.stack([(w * y + y * y + z * z) * common, -2 * z * (w + x + y) * common,
-                            (w * x + x * x + z * z) * common], 1)  # fmt: skip
+                            (w * x + x * x + z * z) * common], 1), None  # fmt: skip
 
 
-def antialiasing_factors(means: Tensor, covariances: Tensor, view: View) -> Tensor:
-    """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + 0.3 px^2|).
+def antialiasing_factors(means: Tensor, covariances: Tensor, view: View, exact: bool) -> Tensor:
+    """Return the factors (n, 1) of antialiasing on opacities: sqrt(|Sigma| / |Sigma + blur|).
 
     They are computed in float64, because the determinant of a long Gaussian is a small difference of large products.
+
+    Args:
+        means, covariances, view: as `screen_covariances` takes them.
+        exact: as in Mip-Splatting, see `layout.VANISHING`; else with graphdeco's lower bound and gradient.
     """
     on_screen = screen_covariances(means.double(), covariances.double(), view)
-    factors: Tensor = _Antialiasing.apply(on_screen)  # type: ignore[no-untyped-call]  # torch's
+    blur = float(view.camera[BLUR])
+    factors: Tensor = (
+        _exact_factors(on_screen, blur) if exact else _Antialiasing.apply(on_screen, blur)  # type: ignore[no-untyped-call]  # torch's
+    )
     return factors[:, None].to(means.dtype)
+
+
+def _exact_factors(covariances: Tensor, blur: float) -> Tensor:
+    xx, xy, yy = covariances.unbind(1)
+    own, wide = xx * yy - xy * xy, (xx + blur) * (yy + blur) - xy * xy
+    shown = own > VANISHING
+    share = torch.where(shown, own, 1.0) / (wide + VANISHING)
+    return torch.where(shown, (share + VANISHING).sqrt(), 0.0)
 
 
 def covariance_gradients(means: Tensor, covariances: Tensor, view: View, kept: Kept, slots: Floats) -> Tensor:

@@ -18,7 +18,15 @@ TILE_PIXELS = TILE * TILE
 NEAR_DEPTH = 0.2
 """Gaussians whose centre is at this depth or nearer are culled."""
 PIXEL_VARIANCE = 0.3
-"""Added to the diagonal of the 2D covariance, in px^2: a Gaussian is never thinner than about a pixel."""
+"""Added to the diagonal of the 2D covariance unless a rasterizer says otherwise, in px^2: a Gaussian is never thinner
+than about a pixel."""
+MIN_SHARE = 2.5e-5
+"""Lower bound, in antialiasing, of the determinant without the blur over that with it."""
+VANISHING = 1e-6
+"""Largest determinant without the blur, in px^4, of Gaussians that Mip-Splatting's antialiasing leaves out.
+
+It also adds as much to the determinant with the blur, and to the quotient of both.
+"""
 JACOBIAN_LIMIT = 1.3
 """The Jacobian is taken at most this many half image sides away from the optical axis."""
 RADIUS_SIGMAS = 3.0
@@ -78,10 +86,11 @@ SLOT = 16
     SUM_ABS_Y,  # |d (FACTOR_XY u + FACTOR_YY v)|
 ) = range(11)
 
-# A camera: rotation and translation from world to camera, row by row; position; intrinsics; limits of x / z and y / z.
-CAMERA = 21
+# A camera: rotation and translation from world to camera, row by row; position; intrinsics; limits of x / z and y / z;
+# the variance added to 2D covariances.
+CAMERA = 22
 ROTATION, TRANSLATION, POSITION = 0, 9, 12
-FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, LIMIT_X, LIMIT_Y = range(15, CAMERA)
+FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, LIMIT_X, LIMIT_Y, BLUR = range(15, CAMERA)
 
 SIGNED_COLOR_BIT = -(2**31)
 """Bit of `sh_degree` that requests signed colour: the sign bit of C's int.

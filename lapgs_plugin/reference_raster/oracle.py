@@ -10,9 +10,9 @@ It has the semantics of the CUDA rasterizers of the 3DGS family:
     background   blended last with the remaining transmittance
 
 In tiles that its rectangle misses, an opaque Gaussian is cut at alpha = o exp(-4.5), which is above 1/255. The image
-depends on that cut.
+depends on that cut. Options of some forks change the tiles, the 0.3 px and the opacities; see `OracleRasterizer`.
 
-Gradients are those of the CUDA code. They differ from the derivative of the image in two places, marked DEPARTURE.
+Gradients are those of the CUDA code. They differ from the derivative of the image in three places, marked DEPARTURE.
 Two guards of the CUDA code against division by zero are left out: 1e-7 is not added to w, nor to the squared
 determinant in the backward pass, where it slightly shortens the gradient of the smallest Gaussians.
 """
@@ -20,7 +20,7 @@ determinant in the backward pass, where it slightly shortens the gradient of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -37,11 +37,13 @@ from lapgs_plugin.reference_raster.layout import (
     MAX_RADIUS,
     MIN_ALPHA,
     MIN_ROOT,
+    MIN_SHARE,
     MIN_TRANSMITTANCE,
     NEAR_DEPTH,
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
+    VANISHING,
 )
 
 
@@ -53,7 +55,7 @@ class Projection:
         ids: (v,) their index in the field.
         depths: (v,) camera-space z.
         means2d: (v, 2) centres in pixel coordinates (the first pixel is at 0).
-        determinants: (v,) of the 2D covariances with the 0.3 px^2 added, in px^4.
+        determinants: (v,) of the 2D covariances with the blur added, in px^4.
         conics: (v, 3) entries xx, xy, yy of the inverse covariance.
         radii: (v,) three-sigma radii in whole pixels, in the field's float type.
         rectangles: (v, 4) int64 tiles touched: x0, y0 (first), x1, y1 (one past the last).
@@ -92,13 +94,27 @@ class OracleRasterizer(Rasterizer):
     Args:
         three_sigma_cut: False for rasterizers that blend a Gaussian wherever alpha reaches 1/255: every Gaussian in
             front of the camera is then in every tile and has a radius.
+        mult: instead of that cut, blend a Gaussian in the tiles that the ellipse of `mult` times the squared distance
+            meets at which alpha reaches 1/255 (FastGS).
+        antialiasing: multiply opacities by sqrt(|Sigma| / |Sigma + blur|), at least by 0.005.
+        exact_antialiasing: do that as Mip-Splatting: leave out what is smaller than `layout.VANISHING`.
+        blur: variance added to 2D covariances, in px^2.
     """
 
     name = "oracle"
     devices = ("cpu",)
 
-    def __init__(self, *, three_sigma_cut: bool = True) -> None:
-        self._three_sigma_cut = three_sigma_cut
+    def __init__(
+        self,
+        *,
+        three_sigma_cut: bool = True,
+        mult: float | None = None,
+        antialiasing: bool = False,
+        exact_antialiasing: bool = False,
+        blur: float = PIXEL_VARIANCE,
+    ) -> None:
+        self._three_sigma_cut = three_sigma_cut and mult is None
+        self._mult, self._antialiasing, self._exact, self._blur = mult, antialiasing, exact_antialiasing, blur
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
@@ -114,7 +130,14 @@ class OracleRasterizer(Rasterizer):
         background = background.to(field.means)  # (3,)
 
         n = len(field)
-        seen = project(field, camera, three_sigma_cut=self._three_sigma_cut)
+        seen = project(field, camera, three_sigma_cut=self._three_sigma_cut, blur=self._blur)
+        opacities = torch.sigmoid(field.opacity_logits[seen.ids])  # (v,)
+        if self._antialiasing:
+            opacities = opacities * antialiasing_factors(seen, self._blur, self._exact)
+        ellipses = None if self._mult is None else Ellipses(seen.means2d, seen.conics, reaches(opacities, self._mult))
+        lists = tile_lists(seen.depths, seen.rectangles, camera, ellipses)
+        if ellipses is not None:
+            lists, seen, opacities = _without_unlisted(lists, seen, opacities)
         means2d = field.means.new_zeros(n, 2).index_put((seen.ids,), seen.means2d)  # (n, 2)
         if means2d.requires_grad:
             means2d.retain_grad()
@@ -127,12 +150,11 @@ class OracleRasterizer(Rasterizer):
             [
                 means2d[seen.ids],  # (v, 2)
                 seen.conics,  # (v, 3)
-                torch.sigmoid(field.opacity_logits[seen.ids])[:, None],  # (v, 1)
+                opacities[:, None],  # (v, 1)
                 sh_to_color(field.sh[seen.ids], directions, degree, signed=field.signed),  # (v, 3)
             ],
             dim=1,
         )  # (v, 9)
-        lists = tile_lists(seen.depths, seen.rectangles, camera)
         color, transmittance = _blend_tiles(splats, seen.ids, lists, absgrad2d)
         height, width = camera.height, camera.width
         color, transmittance = color[:, :height, :width], transmittance[:height, :width]
@@ -140,18 +162,27 @@ class OracleRasterizer(Rasterizer):
         return RenderResult(image, transmittance, radii, means2d, absgrad2d)
 
 
-def project(field: GaussianField, camera: Camera, *, three_sigma_cut: bool = True) -> Projection:
-    """Project the Gaussians that reach the image (EWA); the camera has the field's device and precision."""
+def project(
+    field: GaussianField, camera: Camera, *, three_sigma_cut: bool = True, blur: float = PIXEL_VARIANCE
+) -> Projection:
+    """Project the Gaussians that reach the image (EWA).
+
+    Args:
+        field: n Gaussians.
+        camera: with its pose on the field's device and in its precision.
+        three_sigma_cut, blur: as in `OracleRasterizer`.
+    """
     # Culled without gradients first: in the graph, the zero gradient of a Gaussian times the infinite derivative by a
     # depth or determinant of zero would be NaN.
     with torch.no_grad():
-        everyone = _project_all(field, camera, torch.arange(len(field), device=field.means.device), three_sigma_cut)
+        ids = torch.arange(len(field), device=field.means.device)
+        everyone = _project_all(field, camera, ids, three_sigma_cut, blur)
         first, last = everyone.rectangles[:, :2], everyone.rectangles[:, 2:]  # (n, 2) each
         seen = (everyone.depths > NEAR_DEPTH) & (everyone.determinants != 0) & (first < last).all(dim=1)  # (n,)
-    return _project_all(field, camera, everyone.ids[seen], three_sigma_cut)
+    return _project_all(field, camera, ids[seen], three_sigma_cut, blur)
 
 
-def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_cut: bool) -> Projection:
+def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_cut: bool, blur: float) -> Projection:
     """Project the Gaussians `ids`, also those that do not reach the image."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
     points = field.means[ids] @ rotation.T + translation  # (v, 3) in camera coordinates
@@ -163,9 +194,9 @@ def _project_all(field: GaussianField, camera: Camera, ids: Tensor, three_sigma_
     covariances3d = world_covariances(field.quaternions[ids], field.log_scales[ids])  # (v, 3, 3)
     to_screen = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov) @ rotation  # (v, 2, 3)
     covariances2d = to_screen @ covariances3d @ to_screen.mT  # (v, 2, 2)
-    xx = covariances2d[:, 0, 0] + PIXEL_VARIANCE  # (v,)
+    xx = covariances2d[:, 0, 0] + blur  # (v,)
     xy = covariances2d[:, 0, 1]  # (v,)
-    yy = covariances2d[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    yy = covariances2d[:, 1, 1] + blur  # (v,)
     determinants = xx * yy - xy * xy  # (v,)
     conics = inverse_covariances(xx, xy, yy, determinants)  # (v, 3)
 
@@ -228,6 +259,23 @@ def inverse_covariances(xx: Tensor, xy: Tensor, yy: Tensor, determinants: Tensor
     return torch.stack([yy, -xy, xx], dim=-1) / determinants[:, None]
 
 
+def antialiasing_factors(seen: Projection, blur: float, exact: bool) -> Tensor:
+    """Return the factors (v,) of antialiasing on opacities; see `OracleRasterizer`."""
+    xx, xy, yy = (seen.conics[:, i] * seen.determinants * sign for i, sign in ((2, 1), (1, -1), (0, 1)))
+
+    def share(xx: Tensor, yy: Tensor) -> Tensor:
+        return (xx * yy - xy * xy) / ((xx + blur) * (yy + blur) - xy * xy)
+
+    if exact:
+        own = (xx - blur) * (yy - blur) - xy * xy  # (v,)
+        shown = own > VANISHING  # (v,)
+        share_of_shown = own.where(shown, 1.0) / (seen.determinants + VANISHING)  # (v,)
+        return torch.where(shown, (share_of_shown + VANISHING).sqrt(), 0.0)
+    # DEPARTURE: the CUDA code differentiates the share at covariances that already have the blur.
+    true, shifted = share(xx - blur, yy - blur), share(xx, yy)  # (v,) each
+    return (true.detach() + shifted - shifted.detach()).clamp(min=MIN_SHARE).sqrt()
+
+
 def footprint_radii(xx: Tensor, yy: Tensor, determinant: Tensor) -> Tensor:
     """Return ceil(3 sqrt(lambda_max)) in whole pixels, (n,), with the larger eigenvalue of the 2D covariance.
 
@@ -259,8 +307,54 @@ def tile_rectangles(means2d: Tensor, radii: Tensor, camera: Camera) -> Tensor:
     return corners.nan_to_num(0, math.inf, -math.inf).clamp(min=0).minimum(grid.repeat(2)).to(torch.int64)
 
 
-def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
-    """List every (tile, Gaussian) pair by tile, then depth (v,), then index, from `tile_rectangles` (v, 4)."""
+def reaches(opacities: Tensor, mult: float) -> Tensor:
+    """Return `mult` times the squared Mahalanobis distances at which opacities (v,) become alphas of 1/255."""
+    return 2 * mult * torch.log(opacities.detach() / MIN_ALPHA)
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Hold the ellipses around v Gaussians that tiles are chosen by.
+
+    Attributes:
+        means2d: (v, 2) centres in pixels.
+        conics: (v, 3) entries xx, xy, yy of the inverse covariances.
+        reaches: (v,) squared Mahalanobis distances of their borders; negative ones meet no tile.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    reaches: Tensor
+
+    def nearest(self, which: Tensor, corners: Tensor) -> Tensor:
+        """Return the least squared Mahalanobis distances (i,) of points of tiles.
+
+        Args:
+            which: (i,) a row of the ellipses for each tile.
+            corners: (i, 2) first pixels of the tiles, which reach 16 pixels further.
+        """
+        low = corners - self.means2d[which].detach()  # (i, 2)
+        high = low + TILE  # (i, 2)
+        xx, xy, yy = self.conics[which].detach().unbind(-1)  # (i,) each
+        found = []
+        for x in (low[:, 0], high[:, 0]):  # on an edge, the point nearest to its line's own nearest point
+            y = (-xy * x / yy).clamp(low[:, 1], high[:, 1])
+            found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+        for y in (low[:, 1], high[:, 1]):
+            x = (-xy * y / xx).clamp(low[:, 0], high[:, 0])
+            found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+        around = ((low <= 0) & (high >= 0)).all(1)  # (i,) the centre is in the tile
+        return torch.stack(found).amin(0).masked_fill(around, 0)
+
+
+def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera, ellipses: Ellipses | None = None) -> TileLists:
+    """List every (tile, Gaussian) pair, sorted by tile, then depth, then index.
+
+    Args:
+        depths: (v,) camera-space z.
+        rectangles: (v, 4) tiles touched: x0, y0, x1, y1, as `tile_rectangles` returns them.
+        ellipses: leave out tiles that these do not meet.
+    """
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     order = torch.sort(depths.detach(), stable=True).indices  # (v,) front to back
     x0, y0, x1, y1 = rectangles[order].unbind(-1)  # (v,) each
@@ -268,10 +362,22 @@ def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera) -> TileLists:
     which = torch.repeat_interleave(areas)  # (i,) position in `order`
     within = torch.arange(len(which), device=order.device) - (areas.cumsum(0) - areas)[which]  # (i,) 0 ... area - 1
     width = (x1 - x0)[which]  # (i,)
-    tiles = (y0[which] + within // width) * columns + x0[which] + within % width  # (i,)
+    row, column = y0[which] + within // width, x0[which] + within % width  # (i,) each
+    if ellipses is not None:
+        corners = TILE * torch.stack([column, row], 1).to(depths)  # (i, 2)
+        met = ellipses.nearest(order[which], corners) <= ellipses.reaches[order[which]]  # (i,)
+        which, row, column = which[met], row[met], column[met]
+    tiles = row * columns + column  # (i,)
     by_tile = torch.sort(tiles, stable=True).indices  # (i,)
     counts = torch.bincount(tiles, minlength=columns * rows).tolist()
     return TileLists(order[which[by_tile]], counts, columns, rows)
+
+
+def _without_unlisted(lists: TileLists, seen: Projection, opacities: Tensor) -> tuple[TileLists, Projection, Tensor]:
+    """Leave out the Gaussians that are in no tile."""
+    listed, rows = torch.unique(lists.members, return_inverse=True)
+    kept = Projection(**{name: value[listed] for name, value in vars(seen).items()})
+    return replace(lists, members=rows), kept, opacities[listed]
 
 
 def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tensor) -> tuple[Tensor, Tensor]:

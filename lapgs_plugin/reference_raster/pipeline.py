@@ -19,7 +19,7 @@ from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.lanes import WIDTH, Floats
 from lapgs_plugin.jit.threads import num_threads, parallel
 from lapgs_plugin.reference_raster import ordering_kernels, projection_kernels, tile_kernels
-from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, SLOT, SPLAT, TILE
+from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, PIXEL_VARIANCE, SLOT, SPLAT, TILE
 
 
 @dataclass(frozen=True)
@@ -215,12 +215,23 @@ def gradients(
 
 
 def make_view(
-    width: int, height: int, world_to_camera: Floats, focal: tuple[float, float], principal: tuple[float, float]
+    width: int,
+    height: int,
+    world_to_camera: Floats,
+    focal: tuple[float, float],
+    principal: tuple[float, float],
+    blur: float = PIXEL_VARIANCE,
 ) -> View:
-    """Make a view from a camera as `fields.camera.Camera` describes one; its pose is in the Gaussians' float type."""
+    """Make a view from a camera as `fields.camera.Camera` describes one.
+
+    Args:
+        world_to_camera: (4, 4), in the Gaussians' float type.
+        focal, principal: in pixels, x and y.
+        blur: variance added to 2D covariances, in px^2.
+    """
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     limits = JACOBIAN_LIMIT * width / (2 * focal[0]), JACOBIAN_LIMIT * height / (2 * focal[1])
-    values = [*rotation.ravel(), *translation, *(-rotation.T @ translation), *focal, *principal, *limits]
+    values = [*rotation.ravel(), *translation, *(-rotation.T @ translation), *focal, *principal, *limits, blur]
     return View(width, height, np.array(values, world_to_camera.dtype))
 
 

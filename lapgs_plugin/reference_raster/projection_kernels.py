@@ -48,6 +48,7 @@ from lapgs_plugin.jit.lanes import (
 )
 from lapgs_plugin.reference_raster.layout import (
     BLUE_FREE,
+    BLUR,
     FACTOR_SCALE,
     FACTOR_XX,
     FACTOR_XY,
@@ -62,7 +63,6 @@ from lapgs_plugin.reference_raster.layout import (
     MIN_ROOT,
     NEAR_DEPTH,
     OPACITY_RATE,
-    PIXEL_VARIANCE,
     POSITION,
     PRINCIPAL_X,
     PRINCIPAL_Y,
@@ -328,7 +328,7 @@ def project(
         x_row, y_row = _screen_rows(camera, x_scale, y_scale, near_x, near_y)
         axes = _axes(quat)
         m_x, m_y = _each(_times(x_row, axes), scale), _each(_times(y_row, axes), scale)
-        xx, xy, yy, determinant = _covariance(m_x, m_y)
+        xx, xy, yy, determinant = _covariance(m_x, m_y, camera[BLUR])
 
         radius = _radius(xx, xy, yy)
         box = _rectangle(centre_x, centre_y, radius, tiles_x, tiles_y)
@@ -358,16 +358,16 @@ def project(
 
 
 @inline
-def _covariance(m_x: Lanes3, m_y: Lanes3) -> Lanes4:
-    """Return the entries xx, xy, yy of M M^T + 0.3 I, and its determinant."""
+def _covariance(m_x: Lanes3, m_y: Lanes3, blur: float) -> Lanes4:
+    """Return the entries xx, xy, yy of M M^T + blur I, and its determinant."""
     xx, xy, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
     minors = (
         fma(m_x[0], m_y[1], -(m_x[1] * m_y[0])),
         fma(m_x[0], m_y[2], -(m_x[2] * m_y[0])),
         fma(m_x[1], m_y[2], -(m_x[2] * m_y[1])),
     )
-    determinant = fma(xx + yy, PIXEL_VARIANCE, _dot(minors, minors) + PIXEL_VARIANCE * PIXEL_VARIANCE)
-    return xx + PIXEL_VARIANCE, xy, yy + PIXEL_VARIANCE, determinant
+    determinant = fma(xx + yy, blur, _dot(minors, minors) + blur * blur)
+    return xx + blur, xy, yy + blur, determinant
 
 
 @inline

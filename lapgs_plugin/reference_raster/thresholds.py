@@ -10,12 +10,13 @@ cancellation: the 2D determinant of a needle, for example, is less precise than 
 before the transmittance has certainly fallen under its limit, for any Gaussian
     - alpha is within its bound of 1/255, or of the cap 0.99 and not certainly above it,
     - the transmittance is within its bound of 1e-4,
-    - the bounds of centre, radius (rounded up) and depth (culled at 0.2) leave open if it is in the pixel's tile, or
+    - the bounds of centre, radius (rounded up) or ellipse, and depth (culled at 0.2) leave open if it is in the pixel's
+      tile, or
       its determinant may be 0 (culled) or negative (skipped where the exponent becomes positive),
     - the next contributing Gaussian is not certainly behind it. Exactly equal centres are not masked: their depths are
       computed from the same numbers, so they tie in any implementation, and the index decides.
-For a Gaussian, the mask says if its radius is open and if its gradient has a kink: a colour channel at the clamp, or a
-centre at the limit where the Jacobian is clamped.
+For a Gaussian, the mask says if its radius is open and if its gradient has a kink: a colour channel at the clamp, a
+centre at the limit where the Jacobian is clamped, or a factor of antialiasing at its lower bound.
 
 Gradients mix pixels. Compare those of a loss whose weights vanish on the masked pixels, for Gaussians not at a kink.
 """
@@ -23,7 +24,7 @@ Gradients mix pixels. Compare those of a loss whose weights vanish on the masked
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -38,15 +39,19 @@ from lapgs_plugin.reference_raster.layout import (
     MAX_RADIUS,
     MIN_ALPHA,
     MIN_ROOT,
+    MIN_SHARE,
     MIN_TRANSMITTANCE,
     NEAR_DEPTH,
     PIXEL_VARIANCE,
     RADIUS_SIGMAS,
     TILE,
+    VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import (
+    Ellipses,
     inverse_covariances,
     projection_jacobians,
+    reaches,
     tile_lists,
     tile_rectangles,
     world_covariances,
@@ -110,6 +115,10 @@ def threshold_mask(
     sh_degree: int | None = None,
     tolerance: float | None = None,
     three_sigma_cut: bool = True,
+    mult: float | None = None,
+    antialiasing: bool = False,
+    exact_antialiasing: bool = False,
+    blur: float = PIXEL_VARIANCE,
 ) -> ThresholdMask:
     """Find the pixels and Gaussians whose rendering depends on rounding.
 
@@ -117,19 +126,31 @@ def threshold_mask(
         field: n Gaussians, the same bits as rendered.
         sh_degree: highest SH degree rendered; None means all.
         tolerance: relative error of an elementary result; None takes 8 epsilon of the field's float type.
-        three_sigma_cut: as in `OracleRasterizer`.
+        three_sigma_cut, mult, antialiasing, exact_antialiasing, blur: as in `OracleRasterizer`.
     """
     if tolerance is None:
         tolerance = ROUNDINGS * torch.finfo(field.means.dtype).eps
     field, camera = field.to(dtype=torch.float64), camera.to(field.means.device, torch.float64)
     degree = degree_to_evaluate(field, sh_degree)
-    bounded = _project(field, camera, degree, tolerance, three_sigma_cut)
+    bounded = _project(field, camera, degree, tolerance, three_sigma_cut and mult is None, blur)
+    if antialiasing:
+        bounded = (_dimmed_exactly if exact_antialiasing else _dimmed)(bounded)
+    ellipses = None if mult is None else _ellipses(bounded, mult, tolerance)
     radii, kinks = torch.zeros(2, len(field), dtype=torch.bool, device=field.means.device)  # (n,) each
     radii[bounded.ids], kinks[bounded.ids] = bounded.open_radii, bounded.kinks
-    return ThresholdMask(_open_pixels(bounded, camera, tolerance), radii, kinks)
+    pixels, met_perhaps = _open_pixels(bounded, camera, tolerance, ellipses)
+    radii[bounded.ids[met_perhaps]] = True
+    return ThresholdMask(pixels, radii, kinks)
 
 
-def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float, three_sigma_cut: bool) -> _Bounded:
+def _project(
+    field: GaussianField,
+    camera: Camera,
+    degree: int,
+    tolerance: float,
+    three_sigma_cut: bool,
+    blur: float,
+) -> _Bounded:
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]  # (3, 3), (3,)
     points = field.means @ rotation.T + translation  # (n, 3)
     errors = tolerance * (field.means.abs() @ rotation.abs().T + translation.abs())  # (n, 3)
@@ -144,7 +165,7 @@ def _project(field: GaussianField, camera: Camera, degree: int, tolerance: float
     mean_errors = focal * slope_errors + tolerance * (means2d.abs() + principal.abs())  # (v, 2)
 
     relative = tolerance + 4 * errors.norm(dim=1) / depths  # (v,) error of the Jacobian, twice in the covariance
-    shapes = _shapes(field, ids, points, camera, relative, tolerance)
+    shapes = _shapes(field, ids, points, camera, relative, tolerance, blur)
     may_be_culled = (depths - NEAR_DEPTH <= errors[:, 2] + tolerance) | shapes.degenerate  # (v,)
     surely, possibly = _tiles(means2d, mean_errors, shapes, camera, three_sigma_cut)  # (v, 4) each
     surely = surely * (~may_be_culled)[:, None]  # (v, 4)
@@ -183,6 +204,8 @@ class _Shapes:
         conic_errors: (v,) relative error of the quadratic form with this conic.
         smallest_radii, largest_radii: (v,) whole pixels.
         degenerate: (v,) True where the determinant may round to 0 or below.
+        own, own_errors: (v,) the determinants without the blur.
+        shares, share_errors: (v,) these over the determinants with it.
     """
 
     conics: Tensor
@@ -190,19 +213,23 @@ class _Shapes:
     smallest_radii: Tensor
     largest_radii: Tensor
     degenerate: Tensor
+    own: Tensor
+    own_errors: Tensor
+    shares: Tensor
+    share_errors: Tensor
 
 
 def _shapes(
-    field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float
+    field: GaussianField, ids: Tensor, points: Tensor, camera: Camera, relative: Tensor, tolerance: float, blur: float
 ) -> _Shapes:
     """Compute footprints of Gaussians `ids` at camera-space points (v, 3), with relative errors (v,) of Jacobians."""
     jacobians = projection_jacobians(points, (camera.fx, camera.fy), camera.tan_half_fov)  # (v, 2, 3)
     to_screen = jacobians @ camera.world_to_camera[:3, :3]  # (v, 2, 3)
     covariances = to_screen @ world_covariances(field.quaternions[ids], field.log_scales[ids]) @ to_screen.mT
-    xx, yy = covariances[:, 0, 0] + PIXEL_VARIANCE, covariances[:, 1, 1] + PIXEL_VARIANCE  # (v,)
+    xx, yy = covariances[:, 0, 0] + blur, covariances[:, 1, 1] + blur  # (v,)
     xy = covariances[:, 0, 1]  # (v,)
     # Sigma' is a sum of terms as large as the longest axis seen from the side, even if these cancel.
-    largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + PIXEL_VARIANCE
+    largest_term = jacobians.square().sum((1, 2)) * torch.exp(2 * field.log_scales[ids].amax(1)) + blur
     errors = largest_term * relative  # (v,) of each entry of the covariance
     determinants = xx * yy - xy * xy  # (v,)
     determinant_errors = tolerance * (xx * yy + xy * xy)  # (v,) of the subtraction alone
@@ -215,13 +242,67 @@ def _shapes(
     smallest = determinants.abs() / largest  # (v,) eigenvalue
     radii = RADIUS_SIGMAS * largest.sqrt()  # (v,) before they are rounded up
     radius_errors = RADIUS_SIGMAS * (errors + root_errors) / largest.sqrt() + tolerance * radii  # (v,)
+    own = covariances[:, 0, 0] * covariances[:, 1, 1] - xy * xy  # (v,) determinants without the blur
+    own_errors = (covariances[:, 0, 0] + covariances[:, 1, 1]) * 2 * errors  # (v,)
+    own_errors += tolerance * (covariances[:, 0, 0] * covariances[:, 1, 1] + xy * xy)
+    conic_errors = 2 * errors / smallest + determinant_errors / determinants.abs()  # (v,)
+    shares = own / determinants  # (v,)
     return _Shapes(
         conics=inverse_covariances(xx, xy, yy, determinants),
-        conic_errors=2 * errors / smallest + determinant_errors / determinants.abs(),
+        conic_errors=conic_errors,
         smallest_radii=torch.ceil(radii - radius_errors).clamp(max=MAX_RADIUS),
         largest_radii=torch.ceil(radii + radius_errors).clamp(max=MAX_RADIUS),
         degenerate=determinants.abs() <= determinant_errors + 4 * middle * errors,
+        own=own,
+        own_errors=own_errors,
+        shares=shares,
+        share_errors=own_errors / determinants.abs() + shares.abs() * conic_errors,
     )
+
+
+def _dimmed(bounded: _Bounded) -> _Bounded:
+    """Dim the opacities by antialiasing with its lower bound."""
+    shapes = bounded.shapes
+    shares = shapes.shares.clamp(min=MIN_SHARE)  # (v,)
+    return replace(
+        bounded,
+        opacities=bounded.opacities * shares.sqrt(),
+        opacity_errors=bounded.opacity_errors + shapes.share_errors / shares / 2,
+        kinks=bounded.kinks | ((shapes.shares - MIN_SHARE).abs() <= shapes.share_errors),
+    )
+
+
+def _dimmed_exactly(bounded: _Bounded) -> _Bounded:
+    """Dim the opacities by antialiasing as Mip-Splatting does."""
+    shapes = bounded.shapes
+    shown, is_open = shapes.own > VANISHING, (shapes.own - VANISHING).abs() <= shapes.own_errors  # (v,) each
+    shares = shapes.shares.clamp(min=0) + VANISHING  # (v,)
+    errors = bounded.opacity_errors + shapes.share_errors / shares / 2  # (v,)
+    return replace(
+        bounded,
+        opacities=bounded.opacities * torch.where(shown | is_open, shares.sqrt(), 0),
+        opacity_errors=torch.where(is_open, errors.clamp(min=1), errors),
+        kinks=bounded.kinks | is_open,
+    )
+
+
+@dataclass(frozen=True)
+class _Ellipses:
+    """Hold the ellipses that tiles are chosen by, with the errors (v,) of squared distances near their borders."""
+
+    ellipses: Ellipses
+    errors: Tensor
+
+
+def _ellipses(bounded: _Bounded, mult: float, tolerance: float) -> _Ellipses:
+    limits = reaches(bounded.opacities, mult)  # (v,)
+    steepest = bounded.shapes.conics[:, 0] + bounded.shapes.conics[:, 2]  # (v,) largest eigenvalue at most
+    # Implementations intersect the border with the tiles' edges: their error is one of positions.
+    shifts = bounded.mean_errors.sum(1) + tolerance * (bounded.means2d.abs().sum(1) + TILE)  # (v,) pixels
+    errors = 2 * (limits.clamp(min=0) * steepest).sqrt() * shifts + steepest * shifts * shifts
+    errors += limits.abs() * (bounded.shapes.conic_errors + tolerance)
+    errors += 2 * mult * (bounded.opacity_errors + tolerance)
+    return _Ellipses(Ellipses(bounded.means2d, bounded.shapes.conics, limits), errors)
 
 
 def _tiles(
@@ -262,20 +343,29 @@ def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, to
     return torch.any(values.abs() <= errors, dim=1)
 
 
-def _open_pixels(bounded: _Bounded, camera: Camera, tolerance: float) -> Tensor:
-    """Return (h, w) True where a decision is open."""
+def _open_pixels(
+    bounded: _Bounded, camera: Camera, tolerance: float, ellipses: _Ellipses | None
+) -> tuple[Tensor, Tensor]:
+    """Return (h, w) True where a decision is open, and (v,) True where it is open whether an ellipse meets any tile."""
     lists = tile_lists(bounded.depths, bounded.possibly, camera)
     offsets = torch.arange(TILE, dtype=torch.float64, device=bounded.depths.device)  # (16,)
     mask = torch.zeros(lists.rows, lists.columns, TILE, TILE, dtype=torch.bool, device=bounded.depths.device)
+    met, met_perhaps = torch.zeros(2, len(bounded.ids), dtype=torch.bool, device=bounded.depths.device)  # (v,) each
     for index, members in enumerate(torch.split(lists.members, lists.counts)):
         row, column = divmod(index, lists.columns)
         y, x = torch.meshgrid(offsets + row * TILE, offsets + column * TILE, indexing="ij")  # (16, 16) each
         pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)  # (256, 2)
         x0, y0, x1, y1 = bounded.surely[members].unbind(-1)  # (k,) each
         surely_here = (x0 <= column) & (column < x1) & (y0 <= row) & (row < y1)  # (k,)
+        if ellipses is not None:
+            inside = ellipses.ellipses.reaches[members] - ellipses.ellipses.nearest(members, pixels[:1])  # (k,)
+            perhaps = inside >= -ellipses.errors[members]  # (k,)
+            surely_here = (surely_here & (inside > ellipses.errors[members]))[perhaps]
+            members = members[perhaps]  # noqa: PLW2901  # of the tile's list, those that remain
+            met_perhaps[members], met[members[surely_here]] = True, True
         mask[row, column] = _open_in_tile(bounded, members, surely_here, pixels, tolerance).reshape(TILE, TILE)
     image = mask.permute(0, 2, 1, 3).reshape(lists.rows * TILE, lists.columns * TILE)
-    return image[: camera.height, : camera.width]
+    return image[: camera.height, : camera.width], met_perhaps & ~met
 
 
 def _open_in_tile(bounded: _Bounded, members: Tensor, surely_here: Tensor, pixels: Tensor, tolerance: float) -> Tensor:

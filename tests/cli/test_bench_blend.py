@@ -34,7 +34,7 @@ def test_it_needs_a_gpu() -> None:
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
 def test_shapes() -> None:
     from lapgs_bench.kernels.blend import parse_shapes
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import SHAPE, Shape
+    from lapgs_plugin.gpu_raster.blend_kernels import SHAPE, Shape
 
     assert list(parse_shapes("8, 4x1").values()) == [Shape(8), Shape(4, 1)]
     assert list(parse_shapes(None).values()) == [SHAPE]

@@ -30,8 +30,8 @@ OF_OTHERS = {
     "--filter3d", "--grad_abs_thresh", "--gs_type", "--highfeature_lr", "--ho_iteration", "--kernel_size",
     "--lambda_bce", "--loss_thresh", "--max_n_gaussian", "--mult",
     "--opacity_reset_interval", "--optimizer_type", "--position_lr_final", "--position_lr_max_steps",
-    "--prune_iterations", "--random_background", "--S_estimator", "--save_iterations", "--sh_lower",
-    "--start_checkpoint", "--target_primitives", "--test_iterations",
+    "--prune_iterations", "--random_background", "--ray_jitter", "--S_estimator", "--save_iterations", "--sh_lower",
+    "--start_checkpoint", "--target_primitives", "--test_iterations", "--use_train_speedup",
     # of the authors' release
     "--iter_plan",
     # of the extension in docs/extending.md

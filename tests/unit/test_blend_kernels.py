@@ -12,8 +12,8 @@ import torch
 
 CHECKS = """
 import torch
-from lapgs_plugin.rasterizers.gsplat.blend_kernels import Shape, blend_backward, blend_forward
-from lapgs_plugin.rasterizers.gsplat.records import records_of
+from lapgs_plugin.gpu_raster.blend_kernels import Shape, blend_backward, blend_forward
+from lapgs_plugin.gpu_raster.records import records_of
 
 def blended(means, conics, colors, opacities, background, offsets, flat, height, width):
     # Every pixel blends the pairs of its tile, in order.
@@ -102,7 +102,7 @@ import torch
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
-from lapgs_plugin.rasterizers.gsplat import tiles
+from lapgs_plugin.gpu_raster import tiles
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from tests.gsplat_on_cpu import GsplatOnCpu, gsplat_on_cpu
 

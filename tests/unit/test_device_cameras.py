@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.gpu_raster.cameras import CameraCache
 from tests.training_scene import ring_camera
 
 

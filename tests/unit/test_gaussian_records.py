@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_plugin.rasterizers.gsplat.records import ALIGNMENT, Parameters
+from lapgs_plugin.gpu_raster.records import ALIGNMENT, Parameters
 from tests.training_scene import blob_field
 
 

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.rasterizers.gsplat import bindings, direct, tiles
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
+from lapgs_plugin.gpu_raster import bindings, tiles
+from lapgs_plugin.gpu_raster.cameras import CameraCache
+from lapgs_plugin.rasterizers.gsplat import direct
 from tests.gsplat_on_cpu import blend_forward, direct_on_cpu, sort_by_tile
 from tests.training_scene import blob_field
 from tests.unit.test_blend_kernels import run_checks
@@ -23,8 +24,9 @@ import sys
 import numpy as np
 import torch
 from hypothesis import HealthCheck, Phase, example, given, settings, strategies as st
-from lapgs_plugin.rasterizers.gsplat import direct, tile_kernels
-from lapgs_plugin.rasterizers.gsplat.tile_kernels import sort_by_depth, sort_by_tile
+from lapgs_plugin.gpu_raster import tile_kernels
+from lapgs_plugin.rasterizers.gsplat import direct
+from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
 def expected(radii, means, depths, images, across, down):
     # All tiles whose inside a footprint reaches, for every Gaussian: (tile, depth, Gaussian).

@@ -13,9 +13,9 @@ import torch
 CHECKS = """
 import torch
 from gsplat.cuda import _torch_impl
-from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
-from lapgs_plugin.rasterizers.gsplat.kernels import project, project_backward, project_into
-from lapgs_plugin.rasterizers.gsplat.records import Parameters, records_of
+from lapgs_plugin.gpu_raster.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.kernels import project, project_backward, project_into
+from lapgs_plugin.gpu_raster.records import Parameters, records_of
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
@@ -134,13 +134,14 @@ close(photometric_loss_triton(cut, cut.clone(), 0.2), torch.zeros(()))
 
 from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss
 from lapgs_plugin.ops import position_noise, regularization
-from lapgs_plugin.ops.adam import tensorwise
+from lapgs_plugin.ops.adam import rows, tensorwise
 torch.set_default_device(None)
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert tensorwise.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 8e-7
+assert rows.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
-assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 1e-5
+assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 3e-5
 assert position_noise.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert regularization.triton_works.difference(torch.device(DEVICE)) < 1e-5
 """

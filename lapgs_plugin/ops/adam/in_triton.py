@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -77,6 +78,40 @@ def _tensor_kernel(
     keep1: float, take1: float, keep2: float, take2: float, eps: float, n: int, block: tl.constexpr,
 ) -> None:  # fmt: skip
     _move(values, gradients, means, squares, rate, rate, unbias, 1.0, keep1, take1, keep2, take2, eps, n, 1, block)
+
+
+@triton.jit(do_not_specialize=("n",))
+def _rows_kernel(
+    values: tl.tensor, gradients: tl.tensor, means: tl.tensor, squares: tl.tensor, marked: tl.tensor, rate: float,
+    keep1: float, take1: float, keep2: float, take2: float, eps: float, n: tl.tensor, columns: tl.constexpr,
+    block: tl.constexpr,
+) -> None:  # fmt: skip
+    """Step the marked rows of a tensor of `columns` contiguous numbers each; nothing is read of the others."""
+    start = tl.program_id(0).to(tl.int64) * block * columns
+    for part in range(columns):
+        places = start + part * block + tl.arange(0, block)
+        here = places < n.to(tl.int64) * columns
+        here = here & (tl.load(marked + places // columns, here, 0) != 0)
+        gradient = tl.load(gradients + places, here, 0.0)
+        mean = keep1 * tl.load(means + places, here, 0.0) + take1 * gradient
+        square = keep2 * tl.load(squares + places, here, 0.0) + take2 * gradient * gradient
+        moved = tl.load(values + places, here, 0.0) - rate * mean / (tl.sqrt(square) + eps)
+        tl.store(means + places, mean, here)
+        tl.store(squares + places, square, here)
+        tl.store(values + places, moved, here)
+
+
+def step_rows_triton(
+    values: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, marked: Tensor, rate: float, eps: float
+) -> None:
+    """Do `step_rows` for a contiguous float32 tensor on a CUDA device."""
+    n, (keep1, keep2) = len(values), BETAS
+    numbers = rate, keep1, 1 - keep1, keep2, 1 - keep2, eps, n
+    seen = marked.contiguous().view(torch.uint8)
+    columns = values.numel() // n
+    launch(
+        _rows_kernel, (blocks(n, BLOCK),), values, gradient, mean, square, seen, *numbers, columns=columns, block=BLOCK
+    )
 
 
 def step_tensor_triton(slot: AdamSlot, betas: tuple[float, float], eps: float) -> None:

@@ -14,6 +14,7 @@ from lapgs_plugin.ops.photometric_loss.in_torch import (
     check_arguments,
     photometric_loss_torch,
     ssim,
+    ssim_map_torch,
 )
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
@@ -48,6 +49,18 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     return photometric_loss_torch(prediction, target, ssim_weight, fused or ssim)
 
 
+def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
+    """Return SSIM of each pixel and channel of float32 images (b, c, h, w), differentiable by the prediction.
+
+    The window is an 11x11 Gaussian of sigma 1.5, with zeros outside of the images.
+    """
+    if prediction.shape[1] == 3 and triton_works(prediction, target):
+        from lapgs_plugin.ops.photometric_loss.in_triton import ssim_map_triton
+
+        return ssim_map_triton(prediction, target.detach())
+    return ssim_map_torch(prediction, target.detach())
+
+
 def decoded(target: Tensor) -> Tensor:
     """Return a target in a float type: levels k of uint8 as k / 255."""
     # Divided by a tensor: GPUs multiply by the reciprocal of a number, which differs from how photographs are read.
@@ -56,8 +69,8 @@ def decoded(target: Tensor) -> Tensor:
 
 @matches_reference("the photometric loss in many operations instead of two kernels", 1e-3)
 def triton_works(device: torch.device) -> float:
-    """Compare the loss and its gradient, times the number of values; the gradient is then about 1."""
-    from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
+    """Compare the loss, SSIM of the pixels, and the gradients, times the number of values; these are then about 1."""
+    from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton, ssim_map_triton
 
     # As gsplat returns images: the kernels that are compiled here are then those of training.
     target = torch.linspace(0, 1, 3 * 19 * 47, device=device).view(19, 47, 3).permute(2, 0, 1)
@@ -67,7 +80,13 @@ def triton_works(device: torch.device) -> float:
     results = []
     for loss in (photometric_loss_triton(prediction, levels, 0.2), photometric_loss_torch(*exact, 0.2)):
         results.append((loss, torch.autograd.grad(3.0 * loss, prediction)[0] * target.numel()))
-    return largest((one - other).abs() for one, other in zip(*results, strict=True))
+    for values in (
+        ssim_map_triton(prediction[None], target[None]),
+        ssim_map_torch(exact[0][None], target.double()[None]),
+    ):
+        results.append((values, torch.autograd.grad((values * target).sum(), prediction)[0]))
+    pairs = (*zip(*results[:2], strict=True), *zip(*results[2:], strict=True))
+    return largest((one - other).abs() for one, other in pairs)
 
 
 @lru_cache(maxsize=1)

@@ -23,7 +23,7 @@ SSIM_WINDOW = tuple(weight / math.fsum(_gauss) for weight in _gauss)
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """Return the mean structural similarity of images (3, h, w) or (b, 3, h, w) as 3DGS computes it, differentiable."""
-    return ssim_map(as_batch(prediction), as_batch(target)).mean()
+    return ssim_map_torch(as_batch(prediction), as_batch(target)).mean()
 
 
 def photometric_loss_torch(
@@ -37,7 +37,7 @@ def photometric_loss_torch(
     return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - mean_ssim(as_batch(prediction), as_batch(target)))
 
 
-def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
+def ssim_map_torch(prediction: Tensor, target: Tensor) -> Tensor:
     """Return SSIM (Wang et al. 2004, equation 13) of each pixel and channel of images (b, c, h, w), in that shape.
 
     The window is an 11x11 Gaussian of sigma 1.5. Outside of the images are zeros, and nothing is clamped.

@@ -26,6 +26,7 @@ LEAST_ROWS = 16
 
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
+SSIM_CONSTANTS: dict[str, Any] = {"c1": SSIM_C1, "c2": SSIM_C2}
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.
 OF_ANY_VALUE = (
@@ -69,30 +70,30 @@ def _ssim(
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
+    values: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
-    x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, interleaved: tl.constexpr,
-    window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
+    x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, mapped: tl.constexpr,
+    interleaved: tl.constexpr, window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the derivatives of SSIM by the local means of x, x squared and x y, and add to the loss.
 
     Args:
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
         by_mean, by_square, by_product: with the strides of x.
-        total: the loss.
+        total: the loss; unused if `mapped`.
+        values: SSIM itself, with the strides of x; unused unless `mapped`.
         scale: of y.
     """
     column, color = _place(width, colors, interleaved, block, 2 * radius)
-    image = tl.program_id(2).to(tl.int64)
-    first = tl.program_id(1) * rows
+    image, first = tl.program_id(2).to(tl.int64), tl.program_id(1) * rows
     last = tl.minimum(first + rows, height)
     at_x = image * x_image + color * x_plane + column * x_column
     of_y = y + image * y_image + color * y_plane + column * y_column
     out, inside = tl.join(at_x, at_x + x_column), tl.join(column < width, column + 1 < width)  # (block, 2)
     zero, zeros = tl.zeros((block,), tl.float32), tl.zeros((block, 2), tl.float32)
     sums_x = (zeros,) * (2 * radius)
-    sums_y, sums_square, sums_product, loss = sums_x, sums_x, sums_x, zeros
-    row = first - radius
+    sums_y, sums_square, sums_product, loss, row = sums_x, sums_x, sums_x, zeros, first - radius
     while row < last + radius:  # `range` of a tensor cannot be interpreted
         limit = tl.where((row >= 0) & (row < height), width, 0)  # of the columns; none outside of the image
         x0, x1, y0, y1, square0, square1, product0, product1 = zero, zero, zero, zero, zero, zero, zero, zero
@@ -129,8 +130,11 @@ def _loss_kernel(
             tl.store(by_mean + here, slope, inside)
             tl.store(by_square + here, curvature, inside)
             tl.store(by_product + here, share, inside)
+            if mapped:
+                tl.store(values + here, ssim, inside)
         row += 1
-    tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
+    if not mapped:
+        tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
 
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
@@ -197,8 +201,10 @@ class _PhotometricLoss(torch.autograd.Function):
         maps = [torch.empty_like(prediction) for _ in range(3)]
         assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
         programs, sizes, columns = _launch_of(prediction, target, ssim_weight)
-        constants = {**columns, "c1": SSIM_C1, "c2": SSIM_C2, **CONSTANTS}
-        launch(_loss_kernel, programs, prediction, target, *maps, total, *sizes, **constants)
+        launch(
+            _loss_kernel, programs, prediction, target, *maps, total, total, *sizes, **columns, **SSIM_CONSTANTS,
+            mapped=False, **CONSTANTS,
+        )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         ctx.ssim_weight = ssim_weight
         return total
@@ -211,6 +217,34 @@ class _PhotometricLoss(torch.autograd.Function):
         programs, sizes, columns = _launch_of(prediction, target, ctx.ssim_weight)
         launch(_gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, *sizes, **columns, **CONSTANTS)
         return gradient, None, None
+
+
+class _SsimMap(torch.autograd.Function):
+    """Map (prediction, target), images (b, 3, h, w), to SSIM of each pixel and colour."""
+
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, target: Tensor) -> Tensor:
+        values, *maps = (torch.empty_like(prediction) for _ in range(4))
+        programs, sizes, columns = _launch_of(prediction, target, 1.0)
+        launch(
+            _loss_kernel, programs, prediction, target, *maps, values, values, *sizes, **columns, **SSIM_CONSTANTS,
+            mapped=True, **CONSTANTS,
+        )  # fmt: skip
+        ctx.save_for_backward(prediction, target, *maps)
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_values: Tensor) -> tuple[Tensor, None]:
+        prediction, target, *maps = ctx.saved_tensors
+        gradient = torch.empty_like(prediction)
+        # The kernel takes the derivative of a loss that has -1 / numel of each value, times a factor.
+        by_values = by_values.contiguous()
+        maps = [by_values * each for each in maps]
+        factor = prediction.new_full((), -prediction.numel())
+        programs, sizes, columns = _launch_of(prediction, target, 1.0)
+        launch(_gradient_kernel, programs, prediction, target, *maps, factor, gradient, *sizes, **columns, **CONSTANTS)
+        return gradient, None
 
 
 def _launch_of(
@@ -231,8 +265,17 @@ def _launch_of(
 
 def photometric_loss_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
-    image = as_batch(prediction)
-    if not (image.is_contiguous() or image.movedim(1, -1).is_contiguous()):
-        image = image.contiguous()  # maps and gradient have the strides of the image
+    image = _without_gaps(as_batch(prediction))
     loss: Tensor = _PhotometricLoss.apply(image, as_batch(target), ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss
+
+
+def ssim_map_triton(prediction: Tensor, target: Tensor) -> Tensor:
+    """Do `ssim_map` for float32 images (b, 3, h, w) on a CUDA device, of any strides."""
+    values: Tensor = _SsimMap.apply(prediction.contiguous(), target)  # type: ignore[no-untyped-call]  # torch's
+    return values
+
+
+def _without_gaps(image: Tensor) -> Tensor:
+    """Return an image whose maps and gradient can have its strides."""
+    return image if image.is_contiguous() or image.movedim(1, -1).is_contiguous() else image.contiguous()

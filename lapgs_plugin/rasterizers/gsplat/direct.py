@@ -17,10 +17,10 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras
-from lapgs_plugin.rasterizers.gsplat.records import Parameters, Projected
+from lapgs_plugin.gpu_raster.cameras import DeviceCameras
+from lapgs_plugin.gpu_raster.records import Parameters, Projected
+from lapgs_plugin.gpu_raster.tiles import blend_in_tiles
 from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated, three_sigma_radii
-from lapgs_plugin.rasterizers.gsplat.tiles import blend_in_tiles
 
 GradientTargets = list[weakref.ref[Tensor]]
 """Tensors to which a backward pass writes its gradients by centres and their absolute values, (n, 2) or (c, n, 2) each.
@@ -92,7 +92,7 @@ def forward(
         background: (3,).
         given, cameras, degree, signed, with_geometry: as `kernels.project` takes them.
     """
-    from lapgs_plugin.rasterizers.gsplat.kernels import project
+    from lapgs_plugin.gpu_raster.kernels import project
 
     seen = project(given, cameras, degree, signed, with_geometry)
     size = cameras.width, cameras.height
@@ -124,8 +124,8 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_image: Tensor) -> tuple[Tensor | None, ...]:
-        from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_backward
-        from lapgs_plugin.rasterizers.gsplat.kernels import project_backward
+        from lapgs_plugin.gpu_raster.blend_kernels import blend_backward
+        from lapgs_plugin.gpu_raster.kernels import project_backward
 
         saved = ctx.saved_tensors
         given, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.size)

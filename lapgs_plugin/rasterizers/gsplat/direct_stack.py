@@ -15,9 +15,9 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
-from lapgs_plugin.rasterizers.gsplat.cameras import DeviceCameras, cameras_on_device
-from lapgs_plugin.rasterizers.gsplat.records import RECORD, Parameters
-from lapgs_plugin.rasterizers.gsplat.tiles import blend_in_tiles
+from lapgs_plugin.gpu_raster.cameras import DeviceCameras, cameras_on_device
+from lapgs_plugin.gpu_raster.records import RECORD, Parameters
+from lapgs_plugin.gpu_raster.tiles import blend_in_tiles
 
 
 class DirectStack(FieldStack):
@@ -56,7 +56,7 @@ class DirectStack(FieldStack):
 
     def _blended(self, cameras: Sequence[Camera], behind: Tensor, size: tuple[int, int]) -> Tensor:
         """Return images (f, h, w, 3) of the first fields, over backgrounds (f, 3)."""
-        from lapgs_plugin.rasterizers.gsplat.kernels import project_into
+        from lapgs_plugin.gpu_raster.kernels import project_into
 
         count, like = self._starts[len(cameras)], behind
         radii = torch.empty(count, 2, dtype=torch.int32, device=self._device)

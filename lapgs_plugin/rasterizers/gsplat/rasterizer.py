@@ -28,10 +28,10 @@ from lapgs_plugin.fields.rasterizer import (
     degree_to_evaluate,
     require_color,
 )
+from lapgs_plugin.gpu_raster.cameras import CameraCache
+from lapgs_plugin.gpu_raster.records import RECORD
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
-from lapgs_plugin.rasterizers.gsplat.records import RECORD
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
 from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats

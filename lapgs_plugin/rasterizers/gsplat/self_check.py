@@ -10,9 +10,9 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.gpu_raster.cameras import CameraCache
 from lapgs_plugin.ops.self_check import largest, matches_reference
 from lapgs_plugin.rasterizers.gsplat import direct
-from lapgs_plugin.rasterizers.gsplat.cameras import CameraCache
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 
 LARGEST_DIFFERENCE = 1e-3

@@ -15,7 +15,7 @@ from torch import Tensor
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
-from lapgs_plugin.rasterizers.gsplat.cameras import cameras_on_device
+from lapgs_plugin.gpu_raster.cameras import cameras_on_device
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import footprint_radii
 

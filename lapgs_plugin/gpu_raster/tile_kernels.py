@@ -11,8 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.records import TILE
 from lapgs_plugin.ops.launch import blocks, launch
-from lapgs_plugin.rasterizers.gsplat.records import TILE
 
 BLOCK = 256
 """Gaussians, pairs or tiles of a program."""
@@ -22,10 +22,13 @@ KEYS = (torch.uint8, 0), (torch.int16, -(2**15)), (torch.int32, 0)
 
 @triton.jit
 def _rectangle(
-    radii: tl.tensor, means2d: tl.tensor, gaussian: tl.tensor, across: int, down: int, tile: tl.constexpr
-) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:
+    radii: tl.tensor, means2d: tl.tensor, gaussian: tl.tensor, across: int, down: int, tile: tl.constexpr,
+    boxed: tl.constexpr,
+) -> tuple[tl.tensor, tl.tensor, tl.tensor, tl.tensor]:  # fmt: skip
     """Return the first tile across and down that a footprint touches, and how many; none where it is culled."""
     wide, high = tl.load(radii + 2 * gaussian), tl.load(radii + 2 * gaussian + 1)
+    if boxed:
+        return wide & 0xFFFF, high & 0xFFFF, (wide >> 16) - (wide & 0xFFFF), (high >> 16) - (high & 0xFFFF)
     visible = (wide > 0) & (high > 0)
     # Memory of culled Gaussians was never written.
     x = tl.where(visible, tl.load(means2d + 2 * gaussian), 0.0)
@@ -42,11 +45,11 @@ def _rectangle(
 @triton.jit(do_not_specialize=("n", "across", "down"))
 def _count_kernel(
     radii: tl.tensor, means2d: tl.tensor, order: tl.tensor, counts: tl.tensor,
-    n: int, across: int, down: int, tile: tl.constexpr, block: tl.constexpr,
+    n: int, across: int, down: int, tile: tl.constexpr, block: tl.constexpr, boxed: tl.constexpr,
 ) -> None:  # fmt: skip
     rank = tl.program_id(0) * block + tl.arange(0, block)
     gaussian = tl.load(order + rank, rank < n, 0)
-    _, _, wide, high = _rectangle(radii, means2d, gaussian, across, down, tile)
+    _, _, wide, high = _rectangle(radii, means2d, gaussian, across, down, tile, boxed)
     tl.store(counts + rank, wide * high, rank < n)
 
 
@@ -55,7 +58,7 @@ def _pair_kernel(
     radii: tl.tensor, means2d: tl.tensor, order: tl.tensor, ends: tl.tensor, images: tl.tensor,
     keys: tl.tensor, gaussians: tl.tensor,
     n: int, of_each: int, room: int, across: int, down: int, all_tiles: int, least: int,
-    listed: tl.constexpr, tile: tl.constexpr, block: tl.constexpr,
+    listed: tl.constexpr, tile: tl.constexpr, block: tl.constexpr, boxed: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write tile and Gaussian of each pair, and a tile after the last in the places that remain.
 
@@ -71,7 +74,7 @@ def _pair_kernel(
         low, high = tl.where(before & (low < high), middle + 1, low), tl.where(before, high, middle)
         steps //= 2
     gaussian = tl.load(order + low, there, 0)
-    left, top, wide, _ = _rectangle(radii, means2d, gaussian, across, down, tile)
+    left, top, wide, _ = _rectangle(radii, means2d, gaussian, across, down, tile, boxed)
     inside = (pair - tl.load(ends + low - 1, there & (low > 0), 0)).to(tl.int32)
     wide = tl.maximum(wide, 1)
     image = tl.load(images + gaussian, there, 0) if listed else gaussian // of_each
@@ -104,14 +107,18 @@ def _finish_kernel(
         tl.store(flat + place, tl.load(gaussians + tl.load(places + place, there, 0), there), there)
 
 
-def sort_by_depth(radii: Tensor, means2d: Tensor, depths: Tensor, grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def sort_by_depth(
+    radii: Tensor, means2d: Tensor, depths: Tensor, grid: tuple[int, int], boxed: bool = False
+) -> tuple[Tensor, Tensor]:
     """Sort Gaussians front to back, ties by index, and add up how many tiles they touch.
 
     Args:
-        radii: (..., 2) int32, half sides of the footprints in pixels; 0 where culled.
+        radii: (..., 2) int32, half sides of the footprints in pixels; 0 where culled. Or what `records.Projected` has
+            of the family.
         means2d: (..., 2) in pixels.
         depths: (...) of the Gaussians; any number where culled.
         grid: tiles across and down.
+        boxed: whether radii are the family's.
 
     Returns:
         Their order, (n,) int64 over all cameras, and the sum of tiles of each and those before it, (n,) int64.
@@ -120,19 +127,19 @@ def sort_by_depth(radii: Tensor, means2d: Tensor, depths: Tensor, grid: tuple[in
     counts = torch.empty(len(order), dtype=torch.int32, device=depths.device)
     launch(
         _count_kernel, (blocks(len(order), BLOCK),),
-        radii, means2d, order, counts, len(order), *grid, tile=TILE, block=BLOCK,
+        radii, means2d, order, counts, len(order), *grid, tile=TILE, block=BLOCK, boxed=boxed,
     )  # fmt: skip
     return order, torch.cumsum(counts, 0)
 
 
 def sort_by_tile(
     radii: Tensor, means2d: Tensor, order: Tensor, ends: Tensor, images: Tensor | None, count: int,
-    grid: tuple[int, int], room: int,
+    grid: tuple[int, int], room: int, boxed: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Make the first `room` pairs of Gaussians and tiles, and sort them by tile. Nothing waits for the GPU.
 
     Args:
-        radii, means2d, grid: as `sort_by_depth` takes them.
+        radii, means2d, grid, boxed: as `sort_by_depth` takes them.
         order, ends: its results.
         images: (n,) int64, the image of each Gaussian; None for as many Gaussians in each.
         count: number of images.
@@ -150,6 +157,7 @@ def sort_by_tile(
         _pair_kernel, (blocks(room, BLOCK),),
         radii, means2d, order, ends, order if images is None else images, keys, gaussians,
         n, n // count, room, *grid, all_tiles, least, listed=images is not None, tile=TILE, block=BLOCK,
+        boxed=boxed,
     )  # fmt: skip
     keys, places = torch.sort(keys, stable=True)
     flat = torch.empty_like(gaussians)

@@ -11,15 +11,18 @@ Where gsplat's CUDA part is built already, its sorting is used, which takes the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError
-from lapgs_plugin.rasterizers.gsplat.bindings import compiled_functions, sort_by_gsplat
-from lapgs_plugin.rasterizers.gsplat.records import grid_of
+from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
+from lapgs_plugin.gpu_raster.records import Projected, grid_of
+from lapgs_plugin.gpu_raster.rules import Rules
+
+T = TypeVar("T")
 
 MARGIN, FORGOTTEN = 1.125, 0.02
 """Room by the number of pairs of the last renders, and the share of it that is given up with each render."""
@@ -49,26 +52,69 @@ def blend_in_tiles(
     Raises:
         DeviceMemoryError: there are 2**31 pairs or more.
     """
-    from lapgs_plugin.rasterizers.gsplat.blend_kernels import blend_forward
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_forward
 
     radii, means2d, depths, records = projected[:4]
     if records.is_cuda and (compiled := compiled_functions()) is not None:
         tiles = sort_by_gsplat(compiled, radii, means2d, depths, of_image, count, size)
         return tiles, blend_forward(records, background, *tiles, size, count)
-    from lapgs_plugin.rasterizers.gsplat.tile_kernels import sort_by_depth, sort_by_tile
+    from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid)
-    pairs = _LateNumber(ends[-1])
-    key = records.device, *size, count
+
+    def attempt(room: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        tiles = sort_by_tile(radii, means2d, order, ends, of_image, count, grid, room)
+        return tiles, blend_forward(records, background, *tiles, size, count)
+
+    return _with_room((records.device, *size, count), ends[-1], attempt)
+
+
+def blend_family_in_tiles(
+    projected: Projected, background: Tensor, size: tuple[int, int], rules: Rules, mult: float
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Sort Gaussians of one camera into tiles, front to back, and blend them by the family's rules.
+
+    Args:
+        background, size, rules, mult: as `blend_family` takes them.
+
+    Returns:
+        Offsets and Gaussians of pairs as `blend_family` takes them, and its results.
+
+    Raises:
+        DeviceMemoryError: there are 2**31 pairs or more.
+    """
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_family
+    from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
+
+    radii, means2d, depths, records = projected[:4]
+    grid = grid_of(size)
+    order, ends = sort_by_depth(radii, means2d, depths, grid, True)
+
+    def attempt(room: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
+        tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, room, True)
+        return tiles, blend_family(records, background, *tiles, size, rules, mult)
+
+    return _with_room((records.device, *size, rules), ends[-1], attempt)
+
+
+def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
+    """Return what an attempt with enough room makes.
+
+    Args:
+        key: of renders that have about as many pairs.
+        number: of pairs, on the device.
+        attempt: launches what has room for as many pairs.
+    """
+    pairs = _LateNumber(number)
     room = _rounded(_rooms[key] if key in _rooms else MARGIN * pairs.read())
     while True:
-        tiles = sort_by_tile(radii, means2d, order, ends, of_image, count, grid, room)
-        blended = blend_forward(records, background, *tiles, size, count)
+        made = attempt(room)
         wanted = MARGIN * pairs.read()
         _rooms[key] = max(wanted, (1 - FORGOTTEN) * _rooms.get(key, 0.0))
         if pairs.read() <= room:
-            return tiles, blended
+            return made
+        del made  # its memory is needed
         room = _rounded(wanted)
 
 

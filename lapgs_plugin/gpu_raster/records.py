@@ -14,7 +14,7 @@ TILE = 16
 RECORD, COLOR_IN_RECORD = 12, 8
 """Numbers of a Gaussian's record, which lies together in memory, and where its colour begins.
 
-They are x, y, conic (a, b, c), opacity, two without meaning, red, green, blue, and one more without meaning.
+They are x, y, conic (a, b, c), opacity, two without meaning, red, green, blue, and 1 / depth.
 """
 GRADIENT = 8
 """Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
@@ -28,7 +28,11 @@ def grid_of(size: tuple[int, int]) -> tuple[int, int]:
 
 
 class Parameters(NamedTuple):
-    """Hold a field's parameters, contiguous float32 on one device, each from a multiple of 16 bytes on."""
+    """Hold a field's parameters, contiguous float32 on one device, each from a multiple of 16 bytes on.
+
+    By the family's rules they are activated: opacities for logits, standard deviations or covariances (n, 6) for their
+    logarithms, and colours (n, 3) may come for SH.
+    """
 
     means: Tensor  # (n, 3)
     quaternions: Tensor  # (n, 4)
@@ -40,19 +44,44 @@ class Parameters(NamedTuple):
     def of(cls, field: GaussianField) -> Parameters:
         """Return those of a field, copied where they lie in memory in another way."""
         parts = field.means, field.quaternions, field.log_scales, field.opacity_logits, field.sh
-        contiguous = [part.contiguous() for part in parts]
-        return cls(*(part if part.data_ptr() % ALIGNMENT == 0 else part.clone() for part in contiguous))
+        return cls(*map(aligned, parts))
+
+
+def aligned(part: Tensor) -> Tensor:
+    """Return a tensor as kernels read it, copied where it lies in memory in another way."""
+    part = part.contiguous()
+    return part if part.data_ptr() % ALIGNMENT == 0 else part.clone()
 
 
 class Projected(NamedTuple):
-    """Hold n Gaussians as c cameras see them. Where culled, radii are 0, and only what is visible has a meaning."""
+    """Hold n Gaussians as c cameras see them. Where culled, radii are 0, and only what is visible has a meaning.
+
+    By the family's rules a footprint is in tiles. In the place of its half sides are, of columns and of rows, the first
+    tile and one past the last in 16 bits each. Depths are 0 where culled, and `means2d` is empty.
+    """
 
     radii: Tensor  # (c, n, 2) int32, half sides of a footprint in pixels
     means2d: Tensor  # (c, n, 2) in pixels
     depths: Tensor  # (c, n)
     records: Tensor  # (c, n, RECORD)
-    visible_radii: Tensor  # (c, n) int32 the larger of both, 0 where culled; empty unless described
+    visible_radii: Tensor  # (c, n) int32 the larger of both, the family's of three sigma, 0 where culled; may be empty
     centres: Tensor  # (c, n, 2) as in `RenderResult`; empty unless described
+
+
+class Blended(NamedTuple):
+    """Hold what blending by the family's rules read and made of n Gaussians; see `blend_kernels.blend_family`."""
+
+    records: Tensor
+    offsets: Tensor
+    flat: Tensor
+    image: Tensor  # (1, 3, h, w)
+    counts: Tensor
+    words: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (width, height)."""
+        return self.image.shape[3], self.image.shape[2]
 
 
 def records_of(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> Tensor:

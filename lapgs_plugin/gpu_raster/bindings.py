@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.environment import gsplat_built, installed_version
 from lapgs_plugin.environment.probes import extensions_folder
-from lapgs_plugin.rasterizers.gsplat.records import TILE, grid_of
+from lapgs_plugin.gpu_raster.records import TILE, grid_of
 
 KNOWN_RELEASES = "1.5."
 """Releases of gsplat whose compiled functions have the signatures that are used here."""
