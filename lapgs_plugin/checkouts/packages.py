@@ -22,6 +22,13 @@ DISTRIBUTIONS = {
 BUILT_IN = sys.stdlib_module_names | {"__main__"}
 """Modules of Python, some of them of other systems."""
 
+AUTO, OWN, OURS = "auto", "checkout", "lapgs"
+CHOICES = (AUTO, OWN, OURS)
+"""Values of `--rasterizer`: whose rasterizer renders a checkout."""
+
+COMPANIONS = ("simple_knn", "fused_ssim")
+"""Compiled packages of the family besides its rasterizers."""
+
 INDEX = "pip install "
 README = "install it as the checkout's README says"
 
@@ -77,6 +84,12 @@ def how_to_install(missing: Iterable[MissingPackage]) -> str:
         f"{', '.join(one.name for one in several)}: {how}{' '.join(dict.fromkeys(one.distribution for one in several))}"
         for how, several in alike.items()
     )
+
+
+def changes_path(source: CheckoutSource) -> bool:
+    """Return whether a checkout changes the path of imports itself: only importing says what is missing there."""
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in source.modules.values())
+    return any("sys.path" in text for text in texts)
 
 
 def package_of(module: str) -> str:

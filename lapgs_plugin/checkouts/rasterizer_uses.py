@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from lapgs_plugin.checkouts.syntax import executed_on_import, parsed_quietly, place
 
@@ -35,6 +36,22 @@ class RasterizerUse:
     settings: frozenset[str]
     inputs: frozenset[str]
     outputs: int
+
+
+def unlike(use: RasterizerUse, names: Mapping[str, Any]) -> str:
+    """Return what a rasterizer does not take or wants besides what a checkout passes; empty if nothing is known.
+
+    Args:
+        use: how the checkout uses it.
+        names: what its module has.
+    """
+    parts = list[str]()
+    for settings in (names.get(name) for name in use.names if "setting" in name.lower()):
+        fields, defaults = getattr(settings, "_fields", None), getattr(settings, "_field_defaults", {})
+        if fields is not None and use.settings:
+            parts += [f"takes no {name}" for name in sorted(use.settings - set(fields))]
+            parts += [f"wants {name}" for name in sorted(set(fields) - set(defaults) - use.settings)]
+    return " and ".join(dict.fromkeys(parts))
 
 
 def uses_of_rasterizers(name: str, path: Path, root: Path, modules: Mapping[str, Path]) -> list[RasterizerUse]:

@@ -1,4 +1,4 @@
-"""Choose the CPU stand-in that takes what a checkout passes to its rasterizer and returns what the checkout unpacks."""
+"""Choose the variant that takes what a checkout passes to its rasterizer and returns what the checkout unpacks."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     parts = [f"{verb} {', '.join(what for each, what in found if each == verb)}" for verb in verbs]
     why = f"; the nearest, {near}, {' and '.join(parts)}" if near else ""
     raise MissingExtraError(
-        f"no CPU stand-in for {', '.join(modules) or 'a rasterizer'}, imported in "
+        f"lapgs has no rasterizer in place of {', '.join(modules) or 'the compiled one'}, imported in "
         f"{', '.join(places) or 'the checkout'}, with the settings, inputs and outputs of the checkout{why}; it needs "
-        "a CUDA device"
+        "its own, compiled, and a CUDA device"
     )
 
 

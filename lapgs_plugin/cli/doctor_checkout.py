@@ -1,4 +1,4 @@
-"""Describe a checkout for `lapgs doctor CHECKOUT`, from its sources alone."""
+"""Describe a checkout for `lapgs doctor CHECKOUT`, from its sources and the compiled modules that are installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lapgs_plugin.adapters.base import PARAMETERS
 from lapgs_plugin.adapters.registry import adapter_class, known_extensions
 from lapgs_plugin.checkouts.model_values import explain_values_beside
 from lapgs_plugin.checkouts.other_trainers import known_trainer
-from lapgs_plugin.checkouts.packages import README, missing_packages, package_of
+from lapgs_plugin.checkouts.packages import COMPANIONS, OURS, README, missing_packages, package_of
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
@@ -46,7 +46,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         "Rasterizers": [_rasterizer(use, source) for use in source.rasterizers] or [Finding("none", "problem", unused)],
         "Packages": _packages(source),
         "Schedule": _schedule(source),
-        "lapgs run": [*_kinds_of_models(source), _stand_in(source)],
+        "lapgs run": [*_kinds_of_models(source), _rasterizer_on_gpu(source), _stand_in(source)],
     }
 
 
@@ -100,9 +100,9 @@ def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
 
 
 def _packages(source: CheckoutSource) -> list[Finding]:
-    """Return packages that the script cannot do without and that are not installed, besides rasterizers."""
-    rasterizers = set(map(package_of, source.rasterizer_modules))
-    missing = [one for one in missing_packages(source, known_extensions()) if one.name not in rasterizers]
+    """Return packages that the script cannot do without and that are not installed, besides those that lapgs has."""
+    compiled = {*map(package_of, source.rasterizer_modules), *COMPANIONS}
+    missing = [one for one in missing_packages(source, known_extensions()) if one.name not in compiled]
     if not missing:
         return [Finding("Imports", "ok", "all others are installed")]
     return [Finding(one.name, "absent", f"{one.where} imports it; not installed", one.install) for one in missing]
@@ -149,6 +149,21 @@ def _kinds(source: CheckoutSource) -> list[Finding]:
         return [nested, Finding("laplacian", "ok", f"its rasterizer takes {takes}{but}; {more}")]
     why = f"its rasterizer takes neither {' nor '.join(sorted(COLORS))}, by which a residual has colours of both signs"
     return [nested, Finding("laplacian", "absent", why)]
+
+
+def _rasterizer_on_gpu(source: CheckoutSource) -> Finding:
+    """Return whose rasterizer `lapgs run` would take on a GPU."""
+    from lapgs_plugin.checkouts.compiled_modules import compiled_modules  # imports PyTorch
+
+    kind, option = adapter_class(source.root), "--rasterizer auto"
+    try:
+        found = compiled_modules(source, lambda: kind.stand_in_for(source.root, ()))
+    except MissingExtraError as error:
+        return Finding(option, "absent", str(error))
+    whose = "that of lapgs" if found.rasterizer == OURS else "the checkout's own"
+    if found.beside:
+        whose = "the checkout's own or that of lapgs: the dry run of `lapgs run` compares and times both"
+    return Finding(option, "ok", "; ".join(filter(None, (whose, found.hindrance, found.describe()))))
 
 
 def _stand_in(source: CheckoutSource) -> Finding:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lapgs_plugin.adapters.registry import GENERIC, OWN, adapter_class
+from lapgs_plugin.checkouts import packages
 from lapgs_plugin.cli.bridge import given_options, takes_settings
 from lapgs_plugin.cli.output import log_to_stderr
 from lapgs_plugin.cli.rehearsal import Rehearsal
@@ -22,9 +25,10 @@ from lapgs_plugin.runs.options import PANEL, MeasuringOptions
 
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
+    from lapgs_plugin.checkouts.compiled_modules import CompiledModules
     from lapgs_plugin.runs.watcher import Watcher
 
-OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "verbose", "seed"}
+OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "rasterizer", "verbose", "seed"}
 """Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -53,9 +57,16 @@ class ScriptOptions:
     )
     device: str = option(
         "auto",
-        "cuda, cpu (with CPU stand-ins for the checkout's CUDA extensions), or auto: CUDA if there is a CUDA device, "
-        "else the CPU.",
+        "cuda, cpu (with our modules in place of the checkout's CUDA extensions), or auto: CUDA if there is a CUDA "
+        "device, else the CPU.",
         choices=("auto", "cuda", "cpu"),
+    )
+    rasterizer: str = option(
+        packages.AUTO,
+        "Whose rasterizer renders on a GPU: checkout (its own, compiled), lapgs (ours with its rules, which needs no "
+        "compiler), or auto: where both are there, the dry run times and compares them, and the faster one is taken if "
+        "they agree; --off takes its own. On a CPU it is always ours.",
+        choices=packages.CHOICES,
     )
     verbose: bool = option(
         False, "Log which symbols are replaced, and where they are used.", panel=PANEL, names=("--verbose", "-v")
@@ -89,8 +100,6 @@ def run(
     which `lapgs eval`, `lapgs render`, `lapgs report` and `lapgs view` read. After Ctrl-C, repeat the command with
     --resume to continue. `lapgs doctor CHECKOUT` says what works with a checkout.
     """
-    import logging
-
     from lapgs_plugin.checkouts.script import require_script
     from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
     from lapgs_plugin.environment.device import chosen_device
@@ -104,7 +113,7 @@ def run(
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
     # What is refused by the sources alone is refused before PyTorch is imported.
     path, words = require_script(script), arguments or []
-    kind = _recognised(script, options.backbone, needed=not plain)
+    kind = _recognised(script, options.backbone, needed=not plain or options.rasterizer != packages.AUTO)
     if kind is not None and not options.off:
         source = CheckoutSource.read(script)
         if why := source.hindrance(kind.archived_parameters()):
@@ -112,6 +121,8 @@ def run(
         if not isinstance(context.obj, Rehearsal):
             require_packages(source, options.device)
     device = chosen_device(options.device, "--device cpu runs the checkout on CPU stand-ins")
+    if device == "cpu" and options.rasterizer == packages.OWN:
+        raise UserInputError("--rasterizer checkout needs a CUDA device, and this run is on the CPU; leave it out")
     if measuring.gpu_busy:
         from lapgs_plugin.runs.gpu_busy import require_cuda
 
@@ -139,13 +150,6 @@ def _execute(
     watcher: Watcher,
 ) -> None:
     """Execute the script: with a hierarchy, or unchanged with --off."""
-    from lapgs_plugin.checkouts.source import CheckoutSource
-
-    variant, neighbours = None, False
-    if device == "cpu" and kind is not None:
-        source = CheckoutSource.read(script)
-        variant, neighbours = kind.stand_in_for(source.root, arguments), source.unpacks("distCUDA2")
-    from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
     from lapgs_plugin.runner.context import RunRequest
@@ -155,19 +159,25 @@ def _execute(
     from lapgs_plugin.viewer.preview import save_run_preview
 
     on_device: AbstractContextManager[None] = nullcontext()
+    compiled = None
     if device == "cpu":
-        on_device = cuda_on_cpu(variant, neighbours=neighbours)
+        on_device = _on_cpu(script, arguments, kind)
+    elif kind is not None:
+        compiled = _compiled_modules(script, arguments, kind, options)
+        on_device = compiled.in_place()
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(script, arguments) as loaded:
             if kind is None or (options.off and not options.record):
                 loaded.run_main()
                 return
             if options.off:
-                BareRunRecorder(kind(loaded), device, measuring.gpu_busy).run()
+                reasons = None if compiled is None else compiled.reasons
+                BareRunRecorder(kind(loaded), device, measuring.gpu_busy, reasons).run()
                 return
             request = RunRequest(
                 kind(loaded),
                 settings,
+                compiled,
                 device=device,
                 resume=options.resume,
                 overwrite=options.overwrite,
@@ -182,6 +192,32 @@ def _execute(
         if line is None:
             raise
         raise line from error
+
+
+def _on_cpu(script: Path, arguments: Sequence[str], kind: type[BackboneAdapter] | None) -> AbstractContextManager[None]:
+    """Return a block in which a script runs on the CPU; `kind` is the adapter of its checkout, if it is one."""
+    from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+    from lapgs_plugin.checkouts.source import CheckoutSource
+
+    if kind is None:
+        return cuda_on_cpu(None)
+    source = CheckoutSource.read(script)
+    return cuda_on_cpu(kind.stand_in_for(source.root, arguments), neighbours=source.unpacks("distCUDA2"))
+
+
+def _compiled_modules(
+    script: Path, arguments: Sequence[str], kind: type[BackboneAdapter], options: ScriptOptions
+) -> CompiledModules:
+    """Return whose compiled modules a checkout imports on a GPU, and say which are ours."""
+    from lapgs_plugin.checkouts.compiled_modules import compiled_modules
+    from lapgs_plugin.checkouts.source import CheckoutSource
+
+    source = CheckoutSource.read(script)
+    fitting = partial(kind.stand_in_for, source.root, arguments)
+    found = compiled_modules(source, fitting, options.rasterizer, bare=options.off)
+    if line := found.describe():
+        logging.getLogger(__name__).info("%s", line)
+    return found
 
 
 def _recognised(script: Path, backbone: str | None, *, needed: bool) -> type[BackboneAdapter] | None:

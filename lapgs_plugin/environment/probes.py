@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.environment import PACKAGE, run_program
+from lapgs_plugin.environment import PACKAGE, is_installed, run_program
 from lapgs_plugin.errors import typed_line
 
 
@@ -96,8 +96,12 @@ def _probe_rasterizer() -> dict[str, Any]:
     }
 
 
-def _probe_import(*modules: str) -> dict[str, Any]:
-    for module in modules:
+def _probe_import(*names: str) -> dict[str, Any]:
+    """Import modules, and names of them that are written module:name."""
+    for each in names:
+        module, _, name = each.partition(":")
+        if name and not hasattr(importlib.import_module(module), name) and not is_installed(f"{module}.{name}"):
+            raise ImportError(f"{module} has no {name}")
         importlib.import_module(module)
     return {}
 

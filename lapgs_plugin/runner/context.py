@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.checkouts.compiled_modules import CompiledModules
 from lapgs_plugin.checkouts.level_views import SceneImages
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
@@ -47,6 +48,7 @@ class RunRequest:
     Attributes:
         adapter: of the script's backbone.
         settings: of the hierarchy.
+        compiled: whose compiled modules the checkout imports; None on a CPU, where all are ours.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
         resume: continue the run in the output folder.
         overwrite: replace the run in the output folder.
@@ -57,6 +59,7 @@ class RunRequest:
 
     adapter: BackboneAdapter
     settings: RunSettings = field(default_factory=RunSettings)
+    compiled: CompiledModules | None = None
     device: str = "cuda"
     resume: bool = False
     overwrite: bool = False
@@ -81,7 +84,8 @@ class CheckoutContext:
         self.images, self.stages = SceneImages(), Stages()
         self.parts = IterationParts(self.device, request.measuring.breakdown)
         visibility = EarlyVisibility() if request.settings.run_ahead else None
-        self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, visibility)
+        ours = {} if request.compiled is None else request.compiled.beside
+        self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, visibility, ours)
         self.hooks = HookCaller(self.stages, request.hooks, request.settings.hooks)
         with tempfile.TemporaryFile() as file:  # its clock is behind `time.time_ns`
             self.began = os.fstat(file.fileno()).st_mtime_ns

@@ -24,11 +24,12 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 from lapgs_plugin.adapters.base import PARAMETERS, BackboneAdapter
 from lapgs_plugin.checkouts.absent_modules import NoLog
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
-from lapgs_plugin.checkouts.level_views import shrunk
+from lapgs_plugin.checkouts.level_views import shrunk, view_name
 from lapgs_plugin.checkouts.model_values import explain_values_beside, values_beside
+from lapgs_plugin.checkouts.packages import OWN
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
+from lapgs_plugin.errors import LapgsError, UserInputError, first_line, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
@@ -37,6 +38,8 @@ from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
+from lapgs_plugin.runner.rasterizer_choice import Decision, decide
+from lapgs_plugin.runner.rasterizer_trial import RasterizerCall, trials_of
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK
@@ -45,6 +48,9 @@ logger = logging.getLogger(__name__)
 
 MOST_POINTS = 20_000
 """About how many of the scene's points the dry run starts from."""
+
+TRIED_VIEWS = 3
+"""Views in which rasterizers are compared, at the size of each stage."""
 
 NATIVE_COEFFICIENTS = 15
 """SH coefficients above the first that a rasterizer may read when it does not know the flag of signed colour."""
@@ -134,6 +140,31 @@ class DryRun:
             logger.warning("%s", explain_fallback(self._adapter.rasterizer, self._adapter.root))
         return path
 
+    def choose_rasterizer(self) -> Decision:
+        """Return whose rasterizer trains, after both rendered some views at the size of each stage.
+
+        The Gaussians are those that the checkout makes of the scene's points, and as many of them as later in a run.
+        """
+        module, cameras = self._adapter.rasterizer, self._scene.train
+        cameras = cameras[:: -(-len(cameras) // TRIED_VIEWS)]
+        with undisturbed(self._context.device):
+            try:
+                gaussians = self._new_model()
+                views = [self._view(camera, stage) for stage in self._plan for camera in cameras]
+                own = [self._render(view, gaussians) for view in views]
+            except Exception as error:  # the loop may do what is missing here; else the first iteration fails
+                return Decision(OWN, f"the checkout's own {module}: no view to compare with ({typed_line(error)})")
+            try:
+                with self._context.wrapper.taking_ours():
+                    ours = [self._render(view, gaussians) for view in views]
+                names = [view_name(self._context.images.key(camera)) for _ in self._plan for camera in cameras]
+                calls = map(RasterizerCall.of, names, own, ours)
+                trials = list(trials_of(calls, self._context.device))
+            except Exception as error:  # what a rasterizer cannot do is in its message
+                why = f"that of lapgs cannot take its place ({first_line(error)})"
+                return Decision(OWN, f"the checkout's own {module}: {why}")
+        return decide(module, trials)
+
     def find_image(self) -> None:
         """Render a view, by which the wrapper of the rasterizer knows which of a renderer's images is the model's.
 
@@ -193,12 +224,12 @@ class DryRun:
         gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
         return self._scene.copy(gaussians, call.dataset.model_path, train, test)
 
-    def _view(self, camera: Any) -> Any:
-        """Return a camera at the level of the tried stage."""
-        images, device = self._context.images, self._context.device
+    def _view(self, camera: Any, stage: Stage | None = None) -> Any:
+        """Return a camera at the level of a stage, by default the tried one."""
+        stage, images, device = stage or self._stage, self._context.images, self._context.device
         image = images[images.key(camera)]
-        size = level_size(image.size, self._stage.level)
-        return self._adapter.view_at(camera, size, self._stage.signed, lambda: shrunk(image.load(device), size))
+        size = level_size(image.size, stage.level)
+        return self._adapter.view_at(camera, size, stage.signed, lambda: shrunk(image.load(device), size))
 
     def _render(self, view: Any, gaussians: Any, path: ColorPath | None = None) -> Captured:
         """Render a view over black, of a residual if `path` is given."""

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from lapgs_plugin.adapters.registry import known_extensions
 from lapgs_plugin.checkouts.absent_modules import STOOD_IN
-from lapgs_plugin.checkouts.packages import MissingPackage, how_to_install, missing_packages, package_of
+from lapgs_plugin.checkouts.packages import MissingPackage, changes_path, how_to_install, missing_packages, package_of
 from lapgs_plugin.checkouts.profile import Profile
+from lapgs_plugin.checkouts.rasterizer_uses import unlike
 from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
@@ -24,25 +25,17 @@ def require_matching_rasterizer(profile: Profile, title: str) -> None:
         UserInputError: an installed rasterizer belongs to another code base.
     """
     for rasterizer in profile.rasterizers:
-        use, named = rasterizer.use, (vars(rasterizer.module)[name] for name in rasterizer.settings)
-        for settings in named:
-            fields, defaults = getattr(settings, "_fields", None), getattr(settings, "_field_defaults", {})
-            if fields is None or not use.settings:
-                continue
-            unknown, wanting = use.settings - set(fields), set(fields) - set(defaults) - use.settings
-            if unknown or wanting:
-                found = [f"takes no {name}" for name in sorted(unknown)] + [f"wants {name}" for name in sorted(wanting)]
-                raise UserInputError(
-                    f"the installed {use.module} is not the one of {title}: it {' and '.join(found)}, expected what "
-                    f"{use.where.rpartition(':')[0]} passes; install the checkout's own, as its README says, in an "
-                    "environment of its own"
-                )
+        use = rasterizer.use
+        if why := unlike(use, vars(rasterizer.module)):
+            raise UserInputError(
+                f"the installed {use.module} is not the one of {title}: it {why}, expected what "
+                f"{use.where.rpartition(':')[0]} passes; install the checkout's own, as its README says, in an "
+                "environment of its own, or leave out --rasterizer checkout"
+            )
 
 
 def require_packages(source: CheckoutSource, device: str) -> None:
     """Refuse a checkout whose packages are missing, before anything of it is executed.
-
-    Where the checkout changes the path of imports itself, only importing says what is missing.
 
     Args:
         source: the checkout.
@@ -51,8 +44,7 @@ def require_packages(source: CheckoutSource, device: str) -> None:
     Raises:
         MissingExtraError: some are; the line names all of them.
     """
-    texts = (path.read_text(encoding="utf-8", errors="replace") for path in source.modules.values())
-    if any("sys.path" in text for text in texts):
+    if changes_path(source):
         return
     if missing := _missing(source, on_cpu=True):
         without_gpu = device == "auto" and (gpus_are_hidden() or not driver_version())
@@ -100,6 +92,6 @@ def explain_import_error(error: ImportError, script: Path, *, on_cpu: bool) -> M
 
 
 def _missing(source: CheckoutSource, *, on_cpu: bool) -> list[MissingPackage]:
-    """Return packages that are not installed, on a CPU without those that have stand-ins."""
+    """Return packages that are not installed, without those that lapgs has."""
     missing = missing_packages(source, known_extensions())
-    return [one for one in missing if not (on_cpu and (one.extension or one.name in STOOD_IN))]
+    return [one for one in missing if not (one.extension or (on_cpu and one.name in STOOD_IN))]

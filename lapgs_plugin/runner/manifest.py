@@ -14,6 +14,7 @@ from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
+from lapgs_plugin.runner.rasterizer_choice import CHOICE, Decision
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks
@@ -52,7 +53,12 @@ def scene_reference(path: Path, dataset: Any, masks: str = "none", holds_out: bo
 
 
 def make_manifest(
-    adapter: BackboneAdapter, settings: RunSettings, call: TrainingCall, plan: StagePlan, holds_out: bool
+    adapter: BackboneAdapter,
+    settings: RunSettings,
+    call: TrainingCall,
+    plan: StagePlan,
+    holds_out: bool,
+    rasterizer: Decision | None = None,
 ) -> Manifest:
     """Return the manifest of a run before its first stage.
 
@@ -60,6 +66,7 @@ def make_manifest(
         adapter, settings, plan: of the run.
         call: the script's, for the whole run.
         holds_out: whether its scene has held-out views.
+        rasterizer: whose trains it; None on a CPU.
     """
     dataset, path = call.dataset, Path(call.dataset.source_path)
     return Manifest(
@@ -78,6 +85,7 @@ def make_manifest(
                 "arguments": sys.argv[1:],
             },
             RASTER_SETTINGS: adapter.raster_settings(call),
+            **({} if rasterizer is None else {CHOICE: rasterizer.for_manifest()}),
             "iterations": plan.iterations,
             **settings.for_manifest(),
         },
@@ -135,7 +143,7 @@ def _identity(manifest: Manifest) -> dict[str, Any]:
     scene = {f"{name} of the scene": value for name, value in values.pop("scene").items()}
     settings = values.pop("settings")
     backbone = {name: value for name, value in settings.pop("backbone", {}).items() if name != "arguments"}
-    for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim"):
+    for name in ("images_on", "run_ahead", "fused_adam", "fused_ssim", CHOICE):
         settings.pop(name, None)
     decisive = {
         name: settings.get(name) for name in ("hierarchy", "protocol")

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lapgs_plugin.checkouts.packages import OURS
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
@@ -22,10 +23,11 @@ from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext, TrainingRun
 from lapgs_plugin.runner.dry_run import DryRun
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
+from lapgs_plugin.runner.rasterizer_choice import Decision, decided_without_trials
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import require_place, require_utf8
-from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.manifest import Manifest, read_manifest
 
 logger = logging.getLogger(__name__)
 
@@ -70,16 +72,34 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
         if not settings.has_residuals:
             plan = between_events(plan, schedule, call.variables)
         dry_run = DryRun(context, call, scene, plan, schedule)
+        rasterizer = _choose_rasterizer(context, dry_run, absolute)
         path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
         if settings.dry_run:
             dry_run.run(Path(scratch, "dry_run"), path)
         elif not settings.has_residuals and (context.hooks or images.masked):
             dry_run.find_image()
-        manifest = make_manifest(adapter, settings, call, plan, bool(scene.test))
+        manifest = make_manifest(adapter, settings, call, plan, bool(scene.test), rasterizer)
         with _open_archive(context, absolute, manifest) as archive:
             yield TrainingRun(
                 context, settings, call, scene, plan, schedule, path, archive, folder=folder, scene_files=Path(scratch)
             )
+
+
+def _choose_rasterizer(context: CheckoutContext, dry_run: DryRun, folder: Path) -> Decision | None:
+    """Let the checkout's own rasterizer or ours render from here on; return whose and why, None on a CPU.
+
+    Raises:
+        RunFolderError: the run to continue was started with one that is not to be had now.
+    """
+    request, compiled = context.request, context.request.compiled
+    if compiled is None:
+        return None
+    kept = read_manifest(folder) if request.resume else None
+    decision = decided_without_trials(compiled, kept, tries=request.settings.dry_run) or dry_run.choose_rasterizer()
+    context.wrapper.takes_ours = decision.rasterizer == OURS
+    if compiled.beside or compiled.hindrance:  # else `CompiledModules.describe` has said it
+        logger.info("rasterizer: %s", decision.why)
+    return decision
 
 
 def _open_archive(context: CheckoutContext, folder: Path, manifest: Manifest) -> RunArchive:

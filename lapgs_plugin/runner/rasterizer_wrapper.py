@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -52,9 +54,11 @@ class RasterizerWrapper:
         stages: say how images are rendered.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
         visibility: finds visible Gaussians early; None leaves it to the renderers.
+        ours: our modules, by full name, that may render in place of the checkout's rasterizer, with its settings.
 
     Attributes:
         visibility: as given.
+        takes_ours: whether they do.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
 
@@ -63,8 +67,10 @@ class RasterizerWrapper:
         stages: Stages,
         mark: Callable[[str], None] = lambda part: None,
         visibility: EarlyVisibility | None = None,
+        ours: Mapping[str, ModuleType] | None = None,
     ) -> None:
         self._stages, self._mark, self.visibility = stages, mark, visibility
+        self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
@@ -97,11 +103,25 @@ class RasterizerWrapper:
         """Return replacements where a checkout holds its renderers, and looks rasterizers and their settings up."""
         found = [(place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
         for rasterizer in profile.rasterizers:
-            for name in (*rasterizer.settings, *rasterizer.entries):
-                make = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
-                make = self.settings if name in rasterizer.settings else make
+            # The dry run compares that of the training loop alone.
+            compared = rasterizer.module is profile.rasterizers[0].module
+            ours = self._ours.get(rasterizer.use.module) if compared else None
+            for name in rasterizer.settings:
+                found += [(place, self.settings) for place in profile.places(rasterizer, name)]
+            for name in rasterizer.entries:
+                kind = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
+                make = partial(kind, ours=getattr(ours, name, None))
                 found += [(place, make) for place in profile.places(rasterizer, name)]
         return [Replacement(*place, make, consumer) for place, make in found]
+
+    @contextmanager
+    def taking_ours(self) -> Iterator[None]:
+        """Render inside with our rasterizer."""
+        outer, self.takes_ours = self.takes_ours, True
+        try:
+            yield
+        finally:
+            self.takes_ours = outer
 
     def settings(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the settings' constructor."""
@@ -118,23 +138,24 @@ class RasterizerWrapper:
 
         return make_settings
 
-    def _class(self, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _class(self, original: Callable[..., Any], ours: Callable[..., Any] | None) -> Callable[..., Any]:
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
-            made = original(*args, **kwargs)
+            made = (ours if ours is not None and self.takes_ours else original)(*args, **kwargs)
             if self._stages.rendering is None:
                 return made
             return WrappedRasterizer(made, self._call_now(next(iter((*args, *kwargs.values())), None)))
 
         return make_rasterizer
 
-    def _function(self, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _function(self, original: Callable[..., Any], ours: Callable[..., Any] | None) -> Callable[..., Any]:
         @wraps(original)
         def rasterize(*args: Any, **kwargs: Any) -> Any:
+            chosen = ours if ours is not None and self.takes_ours else original
             if self._stages.rendering is None:
-                return original(*args, **kwargs)
+                return chosen(*args, **kwargs)
             inputs = named_inputs(original, args, kwargs)
             settings = next((value for name, value in inputs.items() if "setting" in name), None)
-            return self._call_now(settings)(original, inputs)
+            return self._call_now(settings)(chosen, inputs)
 
         return rasterize
 

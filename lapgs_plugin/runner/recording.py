@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -46,11 +46,19 @@ class BareRunRecorder(TimedLoop):
         adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
         gpu_busy: profile some iterations; needs a CUDA device.
+        compiled: why modules of ours are in the places of its compiled ones, by package.
     """
 
-    def __init__(self, adapter: BackboneAdapter, device: str, gpu_busy: bool = False) -> None:
+    def __init__(
+        self,
+        adapter: BackboneAdapter,
+        device: str,
+        gpu_busy: bool = False,
+        compiled: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(LoopRecord(torch.device(device)))
         self._adapter, self._device, self._gpu_busy = adapter, torch.device(device), gpu_busy
+        self._compiled = dict(compiled or {})
         self._call: TrainingCall | None = None
         self._scene: Any = None
         self._timeline: list[dict[str, float]] = []
@@ -131,6 +139,7 @@ class BareRunRecorder(TimedLoop):
         record, count = self.record, len(self.gaussians._xyz)
         return {
             "backbone": self._adapter.info.name,
+            **({"compiled": self._compiled} if self._compiled else {}),
             "iterations": self.iteration,
             "train_seconds": record.seconds,
             "saving_seconds": record.overhead.get("saving", 0.0),

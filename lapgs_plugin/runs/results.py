@@ -102,6 +102,7 @@ class BareRecord(Strict):
     """Check the record of a script's own run, as `lapgs run --off --record` measures it (`runner.recording`)."""
 
     backbone: NotRequired[str]
+    compiled: NotRequired[dict[str, str]]
     iterations: PositiveInt
     train_seconds: NonNegativeFloat
     saving_seconds: NonNegativeFloat

@@ -63,7 +63,9 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
     assert use.names == ("GaussianRasterizationSettings", "GaussianRasterizer")
     assert {"antialiasing", "viewmatrix"} < use.settings
     assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
-    stand_in_is_refused(fork, f"no CPU stand-in for {OTHER}, imported in gaussian_renderer/__init__.py:")
+    stand_in_is_refused(
+        fork, f"lapgs has no rasterizer in place of {OTHER}, imported in gaussian_renderer/__init__.py:"
+    )
 
 
 def test_two_rasterizers_of_one_name_are_each_replaced_once(
@@ -147,14 +149,14 @@ def test_packages_that_are_missing_are_named_at_once(fork: Path, capsys: pytest.
     script.write_text(f"{text}\n\ndef late():\n    import later\n", encoding="utf-8")
     (fork / "scripts" / "later.py").write_text("import lazy_\n", encoding="utf-8")
     names = ("einops_", "sklearn_", "wandb_")
-    assert tuple(each.name for each in describe(script)["Packages"]) == (*names[:1], "simple_knn", *names[1:])
+    assert tuple(each.name for each in describe(script)["Packages"]) == names
     with pytest.raises(MissingExtraError) as caught:
         lapgs("run", "--device", "cpu", script)
     assert str(caught.value) == (
         "scripts/train.py:1 needs einops_, which cannot be imported (No module named 'einops_'): pip install einops_; "
         "not installed either: sklearn_, wandb_: pip install sklearn_ wandb_"
     )
-    assert "simple_knn: install it as" in str(explain_import_error(missing("einops_"), script, on_cpu=False))
+    assert "simple_knn" not in str(explain_import_error(missing("einops_"), script, on_cpu=False)), "lapgs has it"
 
 
 def test_what_changes_the_path_of_imports_is_left_to_the_import(fork: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +174,7 @@ def test_a_package_that_the_checkout_brings_is_installed_from_there(fork: Path, 
     (packages,) = (each for each in describe(script)["Packages"] if each.name == "open3d")
     stand_in = describe(script)["lapgs run"][-1].detail
     if code == "CUDAExtension":
-        assert f": {packages.advice}; not installed either: simple_knn: install it as" in on_gpu
+        assert on_gpu.endswith(f": {packages.advice}")
         assert packages.advice == f"pip install --no-build-isolation {folder}"
         assert on_cpu.endswith("no CPU stand-in has what the checkout takes from it; it needs CUDA")
         assert stand_in.startswith("no CPU stand-in for open3d, which scripts/train.py:3 imports from ")

@@ -194,3 +194,10 @@ def test_an_exception_looks_as_if_python_ran_the_script(
         main()
     assert ended.value.code == bare.returncode == 1
     assert capsys.readouterr().err == bare.stderr
+
+
+def test_the_checkouts_own_rasterizer_needs_a_gpu(scene: Path, tmp_path: Path) -> None:
+    stub = STUBS["graphdeco"]
+    words = ["run", "--device", "cpu", "--rasterizer", "checkout", str(stub.script)]
+    with pytest.raises(UserInputError, match="--rasterizer checkout needs a CUDA device"):
+        typer.main.get_command(app)([*words, *arguments(stub, scene, tmp_path / "run")], standalone_mode=False)

@@ -99,7 +99,9 @@ def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
     binding.write_text("from .setup import _C\n\nclass GaussianRasterizer:\n    pass\n")
     (use,) = CheckoutSource.read(checkout / "train.py").rasterizers
     assert (use.module, use.functions) == (module, ("render",))
-    stand_in_is_refused(checkout, f"no CPU stand-in for {module}, imported in gaussian_renderer/__init_")
+    stand_in_is_refused(
+        checkout, f"lapgs has no rasterizer in place of {module}, imported in gaussian_renderer/__init_"
+    )
     (found,) = describe(checkout)["Rasterizers"]
     assert (found.name, found.status) == (module, "ok")
     assert found.detail.startswith("part of the checkout; ")
