@@ -22,7 +22,7 @@ from lapgs_plugin.checkouts.stand_in import fitting_stand_in
 from lapgs_plugin.environment import is_installed
 from lapgs_plugin.environment.probes import run_probe
 from lapgs_plugin.errors import MissingExtraError
-from lapgs_plugin.family import VARIANTS, stand_ins
+from lapgs_plugin.family import VARIANTS, stand_ins, unavailable
 from lapgs_plugin.family.variants import rasterizer_module
 
 NOT_INSTALLED = "not installed"
@@ -39,6 +39,7 @@ class CompiledModules:
         reasons: why they do, by package.
         beside: our modules of rasterizers that it imports its own of, by full name; a dry run may choose them.
         hindrance: why ours cannot take the place of its rasterizer; empty if it can.
+        lacks: what ours cannot do of what its own does; empty if it does all.
     """
 
     rasterizer: str
@@ -47,6 +48,7 @@ class CompiledModules:
     reasons: Mapping[str, str] = field(default_factory=dict)
     beside: Mapping[str, ModuleType] = field(default_factory=dict)
     hindrance: str = ""
+    lacks: str = ""
 
     @property
     def why(self) -> str:
@@ -63,7 +65,8 @@ class CompiledModules:
     def describe(self) -> str:
         """Return one line that says which modules are ours and why; empty if none is."""
         parts = [f"{package} ({reason})" for package, reason in self.reasons.items()]
-        return f"compiled modules of lapgs in place of the checkout's: {', '.join(parts)}" if parts else ""
+        without = f"; its rasterizer does without {self.lacks}" if self.lacks and self.rasterizer == OURS else ""
+        return f"compiled modules of lapgs in place of the checkout's: {', '.join(parts)}{without}" if parts else ""
 
 
 def compiled_modules(
@@ -106,6 +109,7 @@ def compiled_modules(
         reasons=reasons,
         beside={name: ours[name] for name in beside if wanted == AUTO},
         hindrance=hindrance,
+        lacks=unavailable(variant) if variant else "",
     )
 
 

@@ -315,3 +315,14 @@ def test_a_checkout_without_compiled_modules_trains_on_a_gpu(hierarchy: str, sce
     run = RunArchive.open(folder)
     assert run.manifest.complete
     assert run.manifest.settings[CHOICE]["taken"] == OURS
+
+
+def test_what_ours_cannot_do_is_said_where_it_takes_the_place(tmp_path: Path) -> None:
+    settings = "        debug=pipe.debug,\n"
+    more = f"{settings}        kernel_size=0.1,\n        subpixel_offset=None,\n"
+    script = edited_graphdeco(tmp_path / "fork", "gaussian_renderer/__init__.py", settings, more)
+    renderer = script.parent / "gaussian_renderer" / "__init__.py"
+    text = renderer.read_text(encoding="utf-8").replace("        antialiasing=pipe.antialiasing,\n", "")
+    renderer.write_text(text.replace("radii, depth_image = ", "radii = "), encoding="utf-8")
+    assert "(not installed), " in (line := modules_of(script).describe())
+    assert line.endswith("its rasterizer does without pixels that are moved by subpixel_offset (--ray_jitter)")
