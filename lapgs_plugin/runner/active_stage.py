@@ -24,15 +24,15 @@ from lapgs_plugin.errors import (
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
-from lapgs_plugin.runner.joint import JointLevels
-from lapgs_plugin.runner.loop_record import StageRecord
+from lapgs_plugin.runner.joint import JointModels
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
-from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
+from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
 
@@ -61,12 +61,20 @@ class ActiveStage(RunningStage):
         before: StageResult | None,
     ) -> None:
         self._views = StageViews(run, window.stage, call, None if before is None else before.predictions)
-        record = StageRecord(run.archive, window, run.context.parts, run.context.request.measuring.gpu_busy)
+        measuring = run.context.request.measuring
+        record = StageRecord(
+            archive=run.archive,
+            stage=window.stage,
+            iterations=window.total,
+            device=run.device,
+            profiled=window.stage.iterations if measuring.gpu_busy else 0,
+            breakdown=breakdown_on(run.device) if measuring.breakdown else Breakdown(),
+        )
         super().__init__(window.stage, self._views.rendering, record)
         self._context, self._run, self.window, self._finished, self._call = run.context, run, window, finished, call
         self._options, self._adapter, self._archive = run.settings, run.context.adapter, run.archive
         self._model = StageModel(run, self.stage, before)
-        self._joint: JointLevels | None = None
+        self._joint: JointModels | None = None
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
@@ -93,7 +101,7 @@ class ActiveStage(RunningStage):
         finally:
             self._joint = self.gaussians = None
             self._views.close()
-            if self._context.device.type == "cuda":
+            if self._run.device.type == "cuda":
                 torch.cuda.empty_cache()
 
     @property
@@ -123,7 +131,7 @@ class ActiveStage(RunningStage):
         iteration = self.iteration + 1
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
-        self._context.parts.breakdown.mark("other")
+        self.record.breakdown.mark("other")
         every = self._context.request.measuring.test_every
         if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
             elapsed = self.record.elapsed_in_run()
@@ -135,7 +143,8 @@ class ActiveStage(RunningStage):
             self._train_jointly(gaussians)
         count = len(gaussians._xyz) + self._joint_count
         self.record.count(iteration, count)
-        if self.record.write_progress(count) and self._diverged_at is None:
+        if iteration % self.record.history_every == 0:
+            self.record.write_history(iteration, {"elapsed": self.record.elapsed_in_run(), "num_gaussians": count})
             self._note_divergence(gaussians, iteration - 1)
 
     def densified(self, gaussians: Any) -> None:
@@ -167,6 +176,7 @@ class ActiveStage(RunningStage):
         """Announce the stage and start its measurements."""
         self._log_start()
         self.record.start()
+        self.record.rewind_history()
         self._context.hooks.on_stage_start(self.stage)
         self._context.request.watcher.stage_started(self.stage)
 
@@ -197,18 +207,18 @@ class ActiveStage(RunningStage):
             LapgsError: training left nothing to archive, or NaN or inf.
         """
         gaussians, self.gaussians = self.gaussians, None  # what fails from here on is not archived again
-        self.record.stop(self._views.bytes_on_device)
+        self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)
         joint = None if self._joint is None else self._joint.fields(self._exported)
         self._require_finite({self.stage.level: field, **(joint or {})})
         inherited = {"carried": self._model.carried(gaussians), "moments": self._model.moments(gaussians)}
         result = self._result(gaussians, field, **inherited)
-        self.record.archive(field, inherited, joint)
+        inherits = self.stage.level > 0 and any(inherited.values())
+        self._archive.finish_level(self.record.of_level(len(field)), field, inherited if inherits else None, joint)
         if self._views.test and (self.stage.level <= 1 or self._context.request.measuring.test_every is not None):
             self._evaluate(gaussians)
-        psnr = last_psnr(self._archive.history()) if self.stage.level == 0 else {}
-        for line in weak_levels(self._archive.manifest.records[-1:], psnr):
+        for line in self.record.weak_lines():
             logger.warning("%s", line)
         self._compare(gaussians, field)
         self._context.request.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
@@ -228,15 +238,16 @@ class ActiveStage(RunningStage):
     def restore(self) -> StageResult:
         """Return the result of this stage from its archived field."""
         field = self._archive.field(self.stage.level)
-        gaussians = self._adapter.model_of(self._run.call, field.to(self._context.device))
+        gaussians = self._adapter.model_of(self._run.call, field.to(self._run.device))
         return self._result(gaussians, field, *self._model.load_inherited(self._archive))
 
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
-        images = self._views.bytes_on_device
+        images = self._views.images.bytes_on_device
         help_ = "--images-on memory takes them off the GPU" if images else "a larger threshold for densification helps"
+        peak = self.record.counts.peak_gaussians
         return DeviceMemoryError(
-            f"out of GPU memory at level {self.stage.level} with {self.record.peak:,} Gaussians; images held on the "
+            f"out of GPU memory at level {self.stage.level} with {peak:,} Gaussians; images held on the "
             f"GPU: {images / 2**30:.2f} GiB; {help_}, more --levels or a smaller resolution too; "
             f"finished levels ({self._archived_levels()}) are kept, --resume continues after them "
             f"[{first_line(error)}]"
@@ -244,7 +255,7 @@ class ActiveStage(RunningStage):
 
     def _log_start(self) -> None:
         width, height = self.stage.image_size
-        place = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.targets.where]
+        place = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.photos.targets.where]
         logger.info(
             "level %d: %d iterations at %dx%d, images on the %s",
             *(self.stage.level, self.stage.iterations, width, height, place),
@@ -256,8 +267,8 @@ class ActiveStage(RunningStage):
         return ", ".join(map(str, self._archive.available_levels)) or "none"
 
     def _note_divergence(self, gaussians: Any, iteration: int) -> None:
-        """Warn if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
-        if bool(torch.isfinite(gaussians._xyz.detach()).all()):
+        """Warn once if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
+        if self._diverged_at is not None or bool(torch.isfinite(gaussians._xyz.detach()).all()):
             return
         self._diverged_at = iteration
         logger.warning(
@@ -294,18 +305,18 @@ class ActiveStage(RunningStage):
                 watcher.look(self.stage, iteration, lambda: self._fields(gaussians), lambda: False)
 
     def _prune(self, gaussians: Any) -> None:
-        self._context.parts.breakdown.mark("densification")
+        self.record.breakdown.mark("densification")
         prune_least_visible(self._views, gaussians, self._options.prune, self._run.color_path)
-        self._context.parts.breakdown.mark("other")
+        self.record.breakdown.mark("other")
 
     def _train_jointly(self, gaussians: Any) -> None:
         """Optimize the finished fields, too, and render them instead of reading their predictions."""
-        self.record.note_memory(self._views.bytes_on_device)
-        self._views.drop_predictions()
-        self._joint = JointLevels(self._run, self._finished, self._views)
+        self.record.note_memory(self._views.images.bytes_on_device)
+        self._views.images.drop_predictions()
+        self._joint = JointModels(self._run, self._finished, self._views)
+        self._views.predict_jointly(self._joint.predictions())
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
-        self.rendering.accumulated = self._joint
 
     def _evaluate(self, gaussians: Any) -> None:
         """Measure the held-out views of the archived level; a failure costs no more than the measurement."""
@@ -334,7 +345,7 @@ class ActiveStage(RunningStage):
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""
         quality = self._views.held_out_quality(gaussians)
-        self.record.write_quality(iteration, quality, elapsed)
+        self.record.write_history(iteration, {**({} if elapsed is None else {"elapsed": elapsed}), **quality})
         logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._views.test))
 
     def _result(self, gaussians: Any, field: GaussianField, carried: Any, moments: Any) -> StageResult:

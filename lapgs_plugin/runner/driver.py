@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from lapgs_plugin.runner.preparation import prepare
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.step_clock import counting_steps
-from lapgs_plugin.runs.layout import CACHE
 
 logger = logging.getLogger(__name__)
 
@@ -85,14 +83,12 @@ def _train_run(run: TrainingRun) -> Any:
     try:
         acts = "; ".join(run.schedule.describe(run.call.variables)) or "nowhere"
         logger.info("%s acts by iteration: %s", context.adapter.script.path.name, acts)
-        return _run_stages(run) if run.settings.has_residuals else SingleCall(run).train()
+        with run.image_cache():
+            return _run_stages(run) if run.settings.has_residuals else SingleCall(run).train()
     except KeyboardInterrupt:
         kept = ", ".join(map(str, archive.available_levels)) or "none"
         logger.info("stopped; finished levels in %s: %s; --resume continues after them", run.folder, kept)
         raise
-    finally:
-        # A run that is continued makes its images again.
-        shutil.rmtree(archive.path(CACHE), ignore_errors=True)
 
 
 def _run_stages(run: TrainingRun) -> Any:

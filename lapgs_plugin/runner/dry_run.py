@@ -35,11 +35,11 @@ from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, ex
 from lapgs_plugin.runner.archived_values import NESTED_WORKS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext
-from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK
+from lapgs_plugin.stages.record import LoopRecord
 
 logger = logging.getLogger(__name__)
 

@@ -37,7 +37,7 @@ from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runner.manifest import scene_reference
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import exists
+from lapgs_plugin.runs.layout import exists, require_room
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText
 from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.scenes import smallest_size
@@ -223,7 +223,7 @@ def import_run(
         untold = f"--backbone (not given): {run.folder} does not say which backbone trained it"
         raise UserInputError(f"{untold if name is None else f'--backbone {name}'}, expected one of {', '.join(known)}")
     backbone = BACKBONES[name]
-    RunArchive.require_room(out, overwrite)
+    require_room(out, overwrite)
     recorded = {name: value for name, value in run.options.items() if _is_raster_option(name, value)}
     settings = {**backbone.info.raster_defaults, **recorded, **_checked(settings or {})}
     manifest = _manifest(run, backbone.info, scene, settings)

@@ -13,7 +13,7 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, 
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import Profile
-from lapgs_plugin.runner.loop_record import LoopRecord
+from lapgs_plugin.stages.record import LoopRecord
 
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
@@ -37,7 +37,7 @@ class TimedLoop(ABC):
     @property
     def iteration(self) -> int:
         """Running iteration, from 1; 0 before the first."""
-        return self.record.iteration
+        return self.record.counts.iteration
 
     @property
     @abstractmethod

@@ -17,8 +17,6 @@ from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
 """Time between two checkpoints unless a number of iterations is given."""
-LOG_TICKS = 200
-"""Approximate number of history entries and progress updates of a run."""
 
 
 @dataclass
@@ -28,7 +26,7 @@ class BetweenSteps:
     Attributes:
         prepared: the run.
         evaluation: of the stage.
-        monitor: shows progress.
+        monitor: shows counts.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
@@ -52,10 +50,10 @@ class BetweenSteps:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
         evaluation, stop, test_every = self.evaluation, self.stop, self.prepared.control.test_every
-        iteration = run.progress.iteration
+        iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self.samples)
-        due_tick = run.passed(max(1, self.prepared.settings.iterations // LOG_TICKS))
+        due_tick = run.passed(run.record.history_every)
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
         measured = evaluation.held_out(run, due_test, due_sample and test_every is None)
@@ -66,7 +64,7 @@ class BetweenSteps:
         evaluation.warn_of_a_fall(run, measured)
         if self.watcher.wants_look():
             run.settle()
-            with evaluation.overhead.timed("view"):
+            with run.record.overhead.timed("view"):
                 self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: stop.requested)
         if stop.requested or self._checkpoint_is_due(run):
             self._save_checkpoint(run)
@@ -78,29 +76,29 @@ class BetweenSteps:
 
     def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self.last_tick
-        archive, progress = self.prepared.archive, run.progress
-        self.last_tick = (progress.seconds, progress.iteration)
-        finished = sum(record.train_seconds for record in archive.manifest.records if record.level != run.stage.level)
+        counts = run.counts
+        self.last_tick = (counts.seconds, counts.iteration)
         tick = Tick(
             level=run.stage.level,
-            iteration=progress.iteration,
-            elapsed=finished + progress.seconds,
-            loss=progress.loss,
+            iteration=counts.iteration,
+            elapsed=run.record.elapsed_in_run(),
+            loss=run.loss,
             num_gaussians=run.num_optimized,
-            rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
+            rate=(counts.iteration - before_iteration) / max(counts.seconds - before_seconds, 1e-9),
             **measured,
         )
-        archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
+        figures = {name: value for name, value in vars(tick).items() if value is not None}
+        run.record.write_history(counts.iteration, figures)
         self.monitor.tick(run.stage, tick)
 
     def _checkpoint_is_due(self, run: StageRun) -> bool:
         if (every := self.prepared.control.checkpoint_every) is not None:
-            return run.progress.iteration % every < run.step_views
+            return run.counts.iteration % every < run.step_views
         return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
 
     def _save_checkpoint(self, run: StageRun) -> None:
-        run.require_finite(run.progress.iteration)  # Gaussians of NaN are culled: the loss does not show them
-        best, overhead = self.evaluation.best, self.evaluation.overhead
+        run.require_finite(run.counts.iteration)  # Gaussians of NaN are culled: the loss does not show them
+        best, overhead = self.evaluation.best, run.record.overhead
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}

@@ -16,8 +16,8 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.level_images import LevelImages
-from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.exposure import ViewExposures
+from lapgs_plugin.training.joint import CoarserLevels
 
 LossOf = Callable[[Tensor, GaussianField], Tensor]
 """Computes the mean loss of some views from their renders, (3, h, w) or (b, 3, h, w), and the field rendered."""
@@ -29,7 +29,7 @@ class ViewLosses:
 
     Attributes:
         stage: in training.
-        images: the targets.
+        photos: the targets.
         coarser: predict the views.
         hooks: compose, and compute losses.
         rasterizer: renders more of the field for hooks that ask for it.
@@ -38,7 +38,7 @@ class ViewLosses:
     """
 
     stage: Stage
-    images: LevelImages
+    photos: LevelImages
     coarser: CoarserLevels
     hooks: HookDispatcher
     rasterizer: Rasterizer
@@ -48,13 +48,19 @@ class ViewLosses:
     @cached_property
     def is_plain(self) -> bool:
         """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
-        return self.images.weights is None and self.hooks.is_plain(self.stage)
+        return self.photos.weights is None and self.hooks.is_plain(self.stage)
 
     def plain(self, names: Sequence[str]) -> LossOf:
         """Return the loss of some views without hooks."""
-        target = self.images.targets.get_stored(*names)
-        compose = self.coarser.adder(names)
-        return lambda rendered, _: photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)
+        target = self.photos.targets.get_stored(*names)
+        below = self.coarser.predictions()
+        add = None if below is None else below.adder(names)
+
+        def loss(rendered: Tensor, _: GaussianField) -> Tensor:
+            composed = rendered if add is None else add(rendered)
+            return photometric_loss(self.exposed(names, composed), target, self.ssim_weight)
+
+        return loss
 
     def hooked(self, contexts: Sequence[StageContext], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Return the loss of some views by all hooks.
@@ -81,15 +87,15 @@ class ViewLosses:
 
     def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
-        target, coarse_target = self.images.get(*names)
+        (target, coarse_target), below = self.photos.get(*names), self.coarser.predictions()
         context = StageContext(
             stage=self.stage,
             iteration=iterations[-1],
             view=names[-1],
             target=target,
-            accumulated=self.coarser.prediction(names),
+            accumulated=None if below is None else below.get(*names),
             coarse_target=coarse_target,
-            weight=self.images.get_weights(*names),
+            weight=self.photos.get_weights(*names),
         )
         if len(names) == 1 or self.hooks.takes_batches:
             return [context]

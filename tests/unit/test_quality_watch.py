@@ -141,11 +141,11 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     def invented(_: StageEvaluation, run: StageRun, view: View) -> tuple[float, float]:
         assert view.name in aside
         assert run.exposures is not None
-        place = run.stage.level, run.progress.iteration
-        fields[place] = run.model.field.means.detach().clone()
+        moment = run.stage.level, run.counts.iteration
+        fields[moment] = run.model.field.means.detach().clone()
         if run.coarser.joint is not None:
-            along[place] = run.coarser.joint.fields[1].means.clone()
-        return 0.0, 20.0 + (place in {(1, 16), (0, 36)})
+            along[moment] = run.coarser.joint.fields[1].means.clone()
+        return 0.0, 20.0 + (moment in {(1, 16), (0, 36)})
 
     monkeypatch.setattr(StageEvaluation, "_psnr", invented)
     names, monitor = Names(), Said()
