@@ -232,7 +232,9 @@ class ActiveStage(RunningStage):
         self.finish()
         logger.warning(
             "%s() failed after it had trained level %d, which is in the run folder (%s)",
-            *(self._call.function.__name__, self.stage.level, typed_line(error)),
+            self._call.function.__name__,
+            self.stage.level,
+            typed_line(error),
         )
 
     def restore(self) -> StageResult:
@@ -255,10 +257,14 @@ class ActiveStage(RunningStage):
 
     def _log_start(self) -> None:
         width, height = self.stage.image_size
-        place = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.photos.targets.where]
+        where = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.photos.targets.where]
         logger.info(
             "level %d: %d iterations at %dx%d, images on the %s",
-            *(self.stage.level, self.stage.iterations, width, height, place),
+            self.stage.level,
+            self.stage.iterations,
+            width,
+            height,
+            where,
         )
         if self._options.prune and self._prune_at is None:
             logger.warning("%s", unpruned_line(self._options.prune, self.stage.level))
@@ -273,7 +279,8 @@ class ActiveStage(RunningStage):
         self._diverged_at = iteration
         logger.warning(
             "level %d has positions of NaN or inf after iteration %d; while it has, it cannot be archived",
-            *(self.stage.level, iteration),
+            self.stage.level,
+            iteration,
         )
 
     def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
@@ -329,7 +336,8 @@ class ActiveStage(RunningStage):
             logger.warning(
                 "held-out views of level %d could not be measured (%s); the level is in the run folder, and `lapgs "
                 "eval` measures the run",
-                *(self.stage.level, typed_line(error)),
+                self.stage.level,
+                typed_line(error),
             )
 
     def _compare(self, gaussians: Any, field: GaussianField) -> None:

@@ -76,7 +76,9 @@ class NestedStage(ActiveStage):
                 "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
                 "views, or what it made of them, from before its loop cannot train nested levels in one call: "
                 "--hierarchy laplacian makes a call for each level",
-                *(self._call.function.__name__, self.iteration, self.stage.level),
+                self._call.function.__name__,
+                self.iteration,
+                self.stage.level,
             )
         if self.stage.level == 0:
             super()._finish_despite(error)

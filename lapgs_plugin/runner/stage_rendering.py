@@ -123,23 +123,24 @@ class StageRendering:
                 for whole in (camera.world_view_transform, getattr(camera, "full_proj_transform", None)):
                     for matrix in () if whole is None else matrix_keys(whole):
                         self._by_matrix.setdefault(matrix, set()).add(key)
-        values = [each for each in fields_of(settings).values() if isinstance(each, Tensor) and each.shape == (4, 4)]
-        found = [keys for value in values for matrix in matrix_keys(value) if (keys := self._by_matrix.get(matrix))]
-        return set.intersection(*found) if found else set()
+        matrices = [value for value in fields_of(settings).values() if isinstance(value, Tensor)]
+        rows = [matrix for value in matrices if value.shape == (4, 4) for matrix in matrix_keys(value)]
+        candidates = [keys for matrix in rows if (keys := self._by_matrix.get(matrix))]
+        return set.intersection(*candidates) if candidates else set()
 
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         images = self.images
         stores = () if images is None else (images.targets, images.weights)
-        for each in (*stores, self.accumulated if key in self.composed else self._below_target):
-            if each is not None:
-                each.prefetch(key)
+        for store in (*stores, self.accumulated if key in self.composed else self._below_target):
+            if store is not None:
+                store.prefetch(key)
 
     @property
     def prefetches(self) -> bool:
         """Whether images of the running stage are anywhere but on the GPU."""
         stores = () if self.images is None else self.images.stores
-        return any(each is not None and each.where != "gpu" for each in (*stores, self.accumulated))
+        return any(store is not None and store.where != "gpu" for store in (*stores, self.accumulated))
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
@@ -147,23 +148,23 @@ class StageRendering:
         target, below = self.images.targets.get(key), None if key in self.composed else self._below_target
         return target if below is None else target - below.get(key)
 
-    def compose(self, key: str | None, image: Tensor, *, by_place: bool = False) -> Tensor:
+    def compose(self, key: str | None, image: Tensor, *, by_matrix: bool = False) -> Tensor:
         """Return the composed image (3, h, w) of a view.
 
         Args:
             key: of the view; None for other cameras.
             image: (3, h, w) as rendered.
-            by_place: whether the view was recognised by its matrix alone. If the image has another size than its level,
-                it is of a viewer's camera at the same place.
+            by_matrix: whether the view was recognised by its matrix alone. If the image has another size than its
+                level, it is of a viewer's camera at the same pose.
 
         Raises:
             UserInputError: the image has another size than its level; in the backward pass: no view was recognised.
         """
         below = None
-        if key is not None and self.accumulated is not None and (by_place or key in self.composed):
+        if key is not None and self.accumulated is not None and (by_matrix or key in self.composed):
             below = self.accumulated.get(key)
             if below.shape != image.shape:
-                if not by_place:
+                if not by_matrix:
                     raise UserInputError(
                         f"the checkout renders view {view_name(key)} at {image.shape[2]}x{image.shape[1]}, expected "
                         f"{below.shape[2]}x{below.shape[1]}, the size of its level; switch its own resolution schedule "
@@ -193,14 +194,14 @@ class StageRendering:
         inputs: dict[str, Any],
         settings: Any,
         noted: str | None,
-        place: str = "the checkout",
+        called_at: str = "the checkout",
     ) -> Any:
         """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image.
 
         Args:
             rasterizer, inputs, settings: of the call.
             noted: key of the view that a renderer was called with; None if it was called with none.
-            place: file and line where the checkout renders it.
+            called_at: file and line where the checkout renders it.
 
         Raises:
             UserInputError: as `compose`; in the backward pass of a residual's maps beside the image, because they do
@@ -209,15 +210,15 @@ class StageRendering:
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
-        image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
+        image = self.compose(self.key(noted, settings), outputs.image, by_matrix=noted is None)
         if self.capture:
             self.captured = Captured(image, rasterizer, inputs, settings)
-        for each in outputs.maps_beside if self.signed else ():
-            each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
+        for values in outputs.maps_beside if self.signed else ():
+            values.register_hook(partial(_refuse_other_colors, called_at))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)
 
     def render_other(
-        self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, place: str = "the checkout"
+        self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, called_at: str = "the checkout"
     ) -> Any:
         """Return the outputs for colours that are not the model's, such as features or scores, as they are.
 
@@ -225,7 +226,7 @@ class StageRendering:
 
         Args:
             rasterizer, inputs, settings: as of `render`.
-            place: file and line where the checkout renders them.
+            called_at: file and line where the checkout renders them.
 
         Raises:
             UserInputError: in the backward pass of a residual's: it is no image of the whole scene.
@@ -239,13 +240,13 @@ class StageRendering:
                 "%s also renders other values than colours, such as depths or opacities; in a residual they are those "
                 "of its own Gaussians, not the scene's: leave out options that use them, or train with "
                 "--hierarchy nested",
-                place,
+                called_at,
             )
-        found = RasterOutputs.of(outputs, size_of(settings))
-        image = found.image.clone()  # the hook is to see uses of this image alone
+        parts = RasterOutputs.of(outputs, size_of(settings))
+        image = parts.image.clone()  # the hook is to see uses of this image alone
         if image.requires_grad:
-            image.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
-        return found.with_image(image)
+            image.register_hook(partial(_refuse_other_colors, called_at))  # type: ignore[no-untyped-call]  # torch's
+        return parts.with_image(image)
 
     @property
     def _needs_views(self) -> bool:
@@ -259,11 +260,11 @@ class StageRendering:
         return self.accumulated if coarse is None else coarse
 
 
-def _refuse_other_colors(place: str, gradient: Tensor | None) -> None:
+def _refuse_other_colors(called_at: str, gradient: Tensor | None) -> None:
     if gradient is None or not bool(gradient.any()):  # its loss has no weight
         return
     raise UserInputError(
-        f"{place}: the loop trains on an image of other colours than the model's, such as depths or features; a "
+        f"{called_at}: the loop trains on an image of other colours than the model's, such as depths or features; a "
         "residual covers a part of the scene only, so its image of them is not the whole one: leave the option out "
         "that asks for it, or train with --hierarchy nested"
     )

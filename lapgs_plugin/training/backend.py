@@ -75,7 +75,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,
     }
-    if needs_gsplat := [option for option, given in asked.items() if given]:
+    if needs_gsplat := [option for option, chosen in asked.items() if chosen]:
         raise UserInputError(
             f"{', '.join(needs_gsplat)} with --rasterizer {name}: only gsplat on a CUDA device does that; leave it out"
         )

@@ -230,12 +230,12 @@ def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int)
             f"{name} is {'a residual' if field.signed else 'no residual'} of SH degree {field.sh_degree}, expected "
             f"{'a residual' if signed else 'none'} of degree {sh_degree}"
         )
-    for each, tensor in params.items():
-        if not _is_finite(tensor, shapes.get(each), torch.float32):
-            expected = f"finite float32 {shapes.get(each)}"
-            raise ValueError(f"{name}.params.{each} is {_described(tensor)}, expected {expected}")
+    for part, tensor in params.items():
+        if not _is_finite(tensor, shapes.get(part), torch.float32):
+            expected = f"finite float32 {shapes.get(part)}"
+            raise ValueError(f"{name}.params.{part} is {_described(tensor)}, expected {expected}")
     try:
-        _check_moments(model["moments"], {each: shapes[each] for each in params})
+        _check_moments(model["moments"], {part: shapes[part] for part in params})
     except ValueError as error:
         raise ValueError(f"{name}.moments: {error}") from error
 

@@ -116,13 +116,13 @@ def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> De
     Raises:
         UserInputError: it makes something else.
     """
-    made: object = strategy.density_control(schedule, extent)
-    if not isinstance(made, DensityControl):
+    control: object = strategy.density_control(schedule, extent)
+    if not isinstance(control, DensityControl):
         raise UserInputError(
-            f"strategy {type(strategy).__qualname__}: density_control returned a {type(made).__name__}, expected a "
+            f"strategy {type(strategy).__qualname__}: density_control returned a {type(control).__name__}, expected a "
             "DensityControl"
         )
-    return made
+    return control
 
 
 class Densifier(DensityControl):

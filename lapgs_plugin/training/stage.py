@@ -419,9 +419,9 @@ class StageRun:
         except FieldError as error:
             raise self._diverged(str(error), iteration) from error
 
-    def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
+    def _diverged(self, problem: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(
-            f"training diverged at level {self.stage.level}, iteration {iteration}: {what}; "
+            f"training diverged at level {self.stage.level}, iteration {iteration}: {problem}; "
             "finished levels and the last checkpoint are kept, start again with other settings"
         )
 
