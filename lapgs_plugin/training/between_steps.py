@@ -12,7 +12,6 @@ from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
@@ -24,9 +23,8 @@ class BetweenSteps:
     """Do what the last step made due; none of it counts as optimization time.
 
     Attributes:
-        prepared: the run.
         evaluation: of the stage.
-        monitor: shows counts.
+        monitor: shows progress.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
@@ -34,7 +32,6 @@ class BetweenSteps:
         last_checkpoint: when it was written, or when the stage began, by `time.monotonic`.
     """
 
-    prepared: PreparedRun
     evaluation: StageEvaluation
     monitor: Monitor
     watcher: Watcher
@@ -49,19 +46,19 @@ class BetweenSteps:
         Raises:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
-        evaluation, stop, test_every = self.evaluation, self.stop, self.prepared.control.test_every
+        evaluation, stop, test_every = self.evaluation, self.stop, run.prepared.control.test_every
         iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self.samples)
         due_tick = run.passed(run.record.history_every)
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that the iterations in progress do not count as the time of what follows
-        measured = evaluation.held_out(run, due_test, due_sample and test_every is None)
-        if due_sample and self.prepared.aside:
-            evaluation.note_best(run)
+        measured = evaluation.held_out(due_test, due_sample and test_every is None)
+        if due_sample and run.prepared.aside:
+            evaluation.note_best()
         if measured or due_tick:
             self._tick(run, measured)
-        evaluation.warn_of_a_fall(run, measured)
+        evaluation.warn_of_a_fall(measured)
         if self.watcher.wants_look():
             run.settle()
             with run.record.overhead.timed("view"):
@@ -71,7 +68,7 @@ class BetweenSteps:
         if stop.requested:
             raise TrainingStoppedError(
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
-                f"a checkpoint is in {self.prepared.archive.path()}, the same command with --resume continues"
+                f"a checkpoint is in {run.prepared.archive.path()}, the same command with --resume continues"
             )
 
     def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
@@ -92,7 +89,7 @@ class BetweenSteps:
         self.monitor.tick(run.stage, tick)
 
     def _checkpoint_is_due(self, run: StageRun) -> bool:
-        if (every := self.prepared.control.checkpoint_every) is not None:
+        if (every := run.prepared.control.checkpoint_every) is not None:
             return run.counts.iteration % every < run.step_views
         return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
 
@@ -102,5 +99,5 @@ class BetweenSteps:
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}
-            self.prepared.archive.save_checkpoint(state, extends_to=self.prepared.settings.iterations)
+            run.prepared.archive.save_checkpoint(state, extends_to=run.prepared.settings.iterations)
         self.last_checkpoint = time.monotonic()

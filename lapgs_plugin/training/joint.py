@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from typing import Any
@@ -15,9 +15,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.runs.profiling import Breakdown
-from lapgs_plugin.stages.images import StageImages
-from lapgs_plugin.stages.joint import Predictions, RenderedPredictions
+from lapgs_plugin.stages.joint import RenderedPredictions
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses
 
@@ -81,46 +79,3 @@ class JointFields:
     def state(self) -> dict[int, dict[str, Any]]:
         """Return the state of every model by level, for checkpoints."""
         return {level: model.state() for level, model in self.models.items()}
-
-
-@dataclass
-class CoarserLevels:
-    """Predict the training views of a stage by its coarser levels, which are trained jointly in its last part.
-
-    Attributes:
-        images: of the stage, with the predictions.
-        joint_from: the iteration from which the finished fields are trained jointly; None if they never are.
-        unfreeze: makes them trainable, from their state in a checkpoint or, given None, from the archive.
-        breakdown: gets the time in which they are rendered.
-        joint: the fields while they are trained jointly; None before.
-    """
-
-    images: StageImages
-    joint_from: int | None
-    unfreeze: Callable[[dict[int, dict[str, Any]] | None], JointFields]
-    breakdown: Breakdown
-    joint: JointFields | None = None
-
-    def is_joint(self, iteration: int) -> bool:
-        """Return whether the fields are trained jointly in an iteration."""
-        return self.joint_from is not None and iteration >= self.joint_from
-
-    def start_if_joint(self, iteration: int) -> None:
-        """Make the fields trainable in the first iteration that trains them."""
-        if self.is_joint(iteration) and self.joint is None:
-            self.restore(None)
-
-    def restore(self, states: dict[int, dict[str, Any]] | None) -> None:
-        """Train the fields jointly from here on, from a `JointFields.state` or, given None, from the archive."""
-        self.joint = self.unfreeze(states)
-
-    def predictions(self) -> Predictions | None:
-        """Return predictions of the training views for use in an iteration; None without coarser levels."""
-        if self.joint is not None:
-            self.breakdown.mark("forward")
-        return self.images.predictions
-
-    @property
-    def models(self) -> Sequence[TrainableField]:
-        """The fields under joint training."""
-        return () if self.joint is None else tuple(self.joint.models.values())

@@ -52,14 +52,14 @@ class FieldScoring:
             degree: of the SH that are active in it.
             threshold: as `view_scores` takes it.
         """
-        photos, ssim_weight = self.losses.photos, self.losses.ssim_weight
+        photos, ssim_weight = self.losses.images.photos, self.losses.ssim_weight
         chosen = shuffled(len(self.views), self.seed, self.losses.stage.level, iteration)
         plain, grey = _grey(field)
 
         def asked(view: LevelView) -> ScoredView:
             with torch.no_grad():
                 image = self._render(field, view, degree)
-                below, (target, _) = self.losses.coarser.predictions(), photos.get(view.name)
+                below, (target, _) = self.losses.below(), photos.get(view.name)
                 image = image if below is None else image + below.get(view.name)
                 self.breakdown.mark("densification")
                 composed = self.losses.exposed([view.name], image)

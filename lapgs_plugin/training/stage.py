@@ -26,13 +26,14 @@ from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
-from lapgs_plugin.training.joint import CoarserLevels
+from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
+from lapgs_plugin.training.stage_start import joint_fields
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, level_views, view_index
 
@@ -87,11 +88,11 @@ class StageRun:
         images: photos of the training views, and their predictions by the coarser levels.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
         record: measures it.
         say: shows a line to the user.
+        joint: the finished fields while they are trained jointly; None before.
         loss: smoothed loss, NaN before the first iteration and after a finished stage.
         most_views: views in one launch that fit into the GPU's memory; None as long as all have.
         step_views: number of views of the last step.
@@ -107,11 +108,11 @@ class StageRun:
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
-    coarser: CoarserLevels
     exposures: ViewExposures | None
     poses: ViewPoses | None
     record: StageRecord
     say: Callable[[str], None]
+    joint: JointFields | None = None
     loss: float = math.nan
     most_views: int | None = None
     step_views: int = 1
@@ -125,13 +126,14 @@ class StageRun:
         self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
         self._views = level_views(prepared.scene.train, stage.level)
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
+        self._joint_from = settings.joint_from(replace(stage, iterations=self.schedule.iterations))
         self._dropout = settings.dropout_for(len(self._views))
         # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
         self._inherits_moments = stage.signed and settings.inherit_mode == "full"
         self._losses = ViewLosses(
             stage=stage,
-            photos=self.images.photos,
-            coarser=self.coarser,
+            images=self.images,
+            breakdown=self.record.breakdown,
             hooks=self.hooks,
             rasterizer=self._rasterizer,
             exposures=self.exposures,
@@ -194,16 +196,31 @@ class StageRun:
         last = self.counts.iteration
         return any(iteration in iterations for iteration in range(last - self.step_views + 1, last + 1))
 
+    def train_jointly(self, states: dict[int, dict[str, Any]] | None) -> None:
+        """Train the finished fields, too, from here on: from a `JointFields.state` or, given None, from the archive."""
+        self.record.note_memory(self.images.bytes_on_device)
+        self.images.drop_predictions()
+        self.joint = joint_fields(self.prepared, self.poses, states)
+        self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
+
+    def _is_joint(self, iteration: int) -> bool:
+        """Return whether the finished fields are trained jointly in an iteration."""
+        return self._joint_from is not None and iteration >= self._joint_from
+
+    @property
+    def _models(self) -> list[TrainableField]:
+        """The fields under training."""
+        return [self.model, *(() if self.joint is None else self.joint.models.values())]
+
     @property
     def num_optimized(self) -> int:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
-        return len(self.model) + sum(map(len, self.coarser.models))
+        return sum(map(len, self._models))
 
     @property
     def fields(self) -> dict[int, GaussianField]:
         """The fields under training by level, without gradients."""
-        joint = self.coarser.joint
-        return {**({} if joint is None else joint.fields), self.stage.level: self.model.field.detach()}
+        return {**({} if self.joint is None else self.joint.fields), self.stage.level: self.model.field.detach()}
 
     @property
     def counts(self) -> LoopCounts:
@@ -236,7 +253,7 @@ class StageRun:
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
         for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
             degree = self.schedule.active_sh_degree(iteration)
-            key = (self.coarser.is_joint(iteration), view.camera.width, view.camera.height, degree)
+            key = (self._is_joint(iteration), view.camera.width, view.camera.height, degree)
             alike.setdefault(key, []).append(index)
         launches = []
         for (_, width, height, _), group in alike.items():
@@ -274,8 +291,8 @@ class StageRun:
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
         active = None if self._inherits_moments else (self.schedule.active_sh_degree(last) + 1) ** 2
         self.model.step(means_rate, active, rest, scale)
-        if self.coarser.joint is not None:
-            self.coarser.joint.step(means_rate, rest, scale)
+        if self.joint is not None:
+            self.joint.step(means_rate, rest, scale)
         for learned in filter(None, self.transforms.values()):
             learned.after_step(last, len(iterations))
         self._breakdown.mark("densification")
@@ -315,7 +332,7 @@ class StageRun:
 
     def _forget_gradients(self) -> None:
         self._context = None
-        for model in (self.model, *self.coarser.models):
+        for model in self._models:
             for param in model.params.values():
                 param.grad = None
         for learned in filter(None, self.transforms.values()):
@@ -329,7 +346,8 @@ class StageRun:
     def _launch(self, planned: _Planned, then: _Planned | None) -> _Launch:
         """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""
         iterations, last = planned.iterations, planned.iterations[-1]
-        self.coarser.start_if_joint(last)
+        if self.joint is None and self._is_joint(last):
+            self.train_jointly(None)
         views = [at_pose(view, self.poses) for view in planned.views]
         names, cameras = [view.name for view in views], [view.camera for view in views]
         loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names, cameras)
@@ -437,7 +455,7 @@ class StageRun:
             "breakdown": self._breakdown.seconds(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
-            "joint": None if self.coarser.joint is None else self.coarser.joint.state(),
+            "joint": None if self.joint is None else self.joint.state(),
             **{name: None if learned is None else learned.state() for name, learned in self.transforms.items()},
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
@@ -451,7 +469,7 @@ class StageRun:
             for name, value in state["densifier"].items()
         }
         if (joint := state.get("joint")) is not None:
-            self.coarser.restore(joint)
+            self.train_jointly(joint)
         self.restore_transforms(state)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:

@@ -27,7 +27,6 @@ from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.densification import control_of
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.joint import CoarserLevels, JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.planning import iterations_continued, unpruned_levels
@@ -44,7 +43,6 @@ from lapgs_plugin.training.stage_start import (
     first_exposures,
     first_model,
     first_poses,
-    joint_fields,
     photos_of,
     predict_views,
 )
@@ -161,7 +159,7 @@ class Trainer:
             if stage.signed:
                 predict_views(prepared, stage, images, record.overhead)
             run = self._stage_run(stage, schedule, model, images, record, checkpoint)
-            evaluation = StageEvaluation(prepared, images, record, self._quality, self.monitor)
+            evaluation = StageEvaluation(run, self._quality, self.monitor)
             if checkpoint is not None:
                 evaluation.best = checkpoint.get("best")
                 self._restore(run, checkpoint)
@@ -169,12 +167,11 @@ class Trainer:
                 self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
             record.rewind_history()
             if before is not None and checkpoint is None and aside:
-                evaluation.note_best(run)  # the finished run's state is the one to beat
+                evaluation.note_best()  # the finished run's state is the one to beat
             self.monitor.stage_started(run.stage, record.counts.iteration + 1)
             if checkpoint is None:
                 self._say_if_nothing_is_visible(run)
             between_steps = BetweenSteps(
-                prepared=prepared,
                 evaluation=evaluation,
                 monitor=self.monitor,
                 watcher=self.watcher,
@@ -186,7 +183,7 @@ class Trainer:
             self.watcher.stage_started(run.stage)
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
-            evaluation.return_to_best(run)
+            evaluation.return_to_best()
             record.note_memory(images.bytes_on_device)
             self._archive_stage(run, extends=before is not None)
             self.watcher.stage_finished(run.stage, lambda: run.fields)
@@ -269,14 +266,6 @@ class Trainer:
         prepared, poses = self.prepared, first_poses(self.prepared, stage)
         if record.counts.iteration == 0:
             record.counts.start_gaussians = len(model)
-
-        def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
-            record.note_memory(images.bytes_on_device)
-            images.drop_predictions()
-            joint = joint_fields(prepared, poses, states)
-            images.predictions = images.held_out = joint.predictions(prepared.pyramid)
-            return joint
-
         return StageRun(
             prepared=prepared,
             stage=replace(stage, iterations=schedule.end),
@@ -285,7 +274,6 @@ class Trainer:
             hooks=self._hooks,
             model=model,
             densifier=control_of(self._strategy_of(stage), schedule, prepared.scene.extent),
-            coarser=CoarserLevels(images, prepared.settings.joint_from(stage), unfreeze, record.breakdown),
             exposures=first_exposures(prepared, stage, checkpoint, record.overhead, self.monitor),
             poses=poses,
             record=record,
@@ -307,7 +295,7 @@ class Trainer:
         """Archive a finished stage, or the longer training of one that was finished before."""
         stage, field = run.stage, run.model.field.detach()
         settings, archive = self.prepared.settings, self.prepared.archive
-        record, joint = run.record.of_level(len(field)), run.coarser.joint
+        record, joint = run.record.of_level(len(field)), run.joint
         along = {} if joint is None else joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
         poses = None if run.poses is None else run.poses.archived()
