@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
-from lapgs_plugin.errors import TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import TrainingDivergedError
 from lapgs_plugin.hierarchy import settings
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
@@ -349,10 +349,3 @@ def test_nan_in_one_of_them_leaves_all_as_they_were(big: Path, tmp_path: Path, m
         three_levels(big, folder)
     assert " of level 1, trained jointly; " in str(caught.value)
     assert plys(RunArchive.open(folder)) == before
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
-def test_a_share_is_one(share: float, scene: Path, tmp_path: Path) -> None:
-    with loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter, pytest.raises(UserInputError) as error:
-        drive_residuals(adapter, joint=share)
-    assert str(error.value) == f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25"
