@@ -47,7 +47,7 @@ class ActiveStage(RunningStage):
         before: result of the last of them; None for the base.
 
     Attributes:
-        returned: what the script's call returned, for its main block.
+        returned: result of the script's call, for its main block.
     """
 
     record: StageRecord
@@ -122,7 +122,7 @@ class ActiveStage(RunningStage):
         return scene
 
     def optimizers_made(self, gaussians: Any) -> None:
-        """Prepare the optimizers that the checkout has just set up, some in the middle of a stage again."""
+        """Prepare the optimizers that the checkout has just set up; some set them up again in the middle of a stage."""
         self._model.prepare_optimizers(gaussians, inherit=self.iteration == 0)
         if self._joint is not None:
             self._joint.follow(gaussians, self._options.color_factor)
@@ -206,7 +206,7 @@ class ActiveStage(RunningStage):
         Raises:
             LapgsError: training left nothing to archive, or NaN or inf.
         """
-        gaussians, self.gaussians = self.gaussians, None  # what fails from here on is not archived again
+        gaussians, self.gaussians = self.gaussians, None  # an error from here on does not archive it again
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)
@@ -341,7 +341,7 @@ class ActiveStage(RunningStage):
             )
 
     def _compare(self, gaussians: Any, field: GaussianField) -> None:
-        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run."""
+        """Compare the archived field with the checkout's own render of it: some quantize or filter late in a run."""
         if self.stage.level > 0 and self._options.nested:
             return
         rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)

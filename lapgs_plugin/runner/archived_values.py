@@ -1,4 +1,4 @@
-"""Compare what a checkout's rasterizer gets for a model with the field that is archived of it."""
+"""Compare a rasterizer's inputs for a checkout's model with the archived field of that model."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def explain_other_values(adapter: BackboneAdapter, captured: Captured, field: Ga
 
 
 def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
-    """Yield what is rendered otherwise than the field has it, activated or as its parameters."""
+    """Yield the kinds of values that are rendered and differ from the field's, activated or as parameters."""
     logits = field.opacity_logits[:, None]
     archived = (
         ("positions", "means3D", (field.means,)),

@@ -60,7 +60,7 @@ class HierarchyDriver:
         return self._folder
 
     def _train(self, call: TrainingCall) -> Any:
-        """Train the hierarchy in place of the script's call of `training`, and return what its last call returned."""
+        """Train the hierarchy in place of the script's call of `training`, and return the result of its last call."""
         profile = self._context.adapter.profile
         if len(profile.source.models) > 1:
             with undisturbed(self._context.device):
@@ -77,7 +77,7 @@ class HierarchyDriver:
 
 
 def _train_run(run: TrainingRun) -> Any:
-    """Train the stages that are not in the archive, and return what the script's last call returned."""
+    """Train the stages that are not in the archive, and return the result of the script's last call."""
     context, archive = run.context, run.archive
     context.request.watcher.run_started(archive)
     try:
@@ -92,12 +92,12 @@ def _train_run(run: TrainingRun) -> Any:
 
 
 def _run_stages(run: TrainingRun) -> Any:
-    """Train or restore all stages, each by a call of its own length, and return what the last call returned."""
+    """Train or restore all stages, each by a call of its own length, and return the result of the last one."""
     adapter, finished = run.context.adapter, list[FinishedStage]()
     before: StageResult | None = None
     for stage in run.plan:
         window = run.context.window(run.plan, stage)
-        # Arguments are the adapter's to change, all else is what the script's tree says.
+        # The adapter changes arguments; the rest follows from the script's syntax tree.
         call = adapter.stage_call(run.call, window, str(run.archive.path(f"level_{stage.level}")))
         changed = run.schedule.for_stage(run.call.variables, call.values, window, adapter.info.unscaled)
         if changed.notes:

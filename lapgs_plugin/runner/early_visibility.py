@@ -23,11 +23,11 @@ from lapgs_plugin.checkouts.syntax import stored_names
 logger = logging.getLogger(__name__)
 
 VISIBLE, MASK, INDEX = "_lapgs_visible", "_lapgs_mask", "_lapgs_index"
-"""Names of what takes the place of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
+"""Names of the replacements of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
 COUNTED = "num_rendered"
 """Attribute in which the family's rasterizers keep the number of pairs for their backward pass."""
 KEY = "visibility_filter"
-"""Name of the mask or the indices among what the family's renderers return."""
+"""Name of the mask or the indices in the results of the family's renderers."""
 PROJECTED, RADII, INDICES = "_lapgs_projected", "_lapgs_radii", "_lapgs_indices"
 """Attributes of radii that are there, which holds their version; of a mask: its radii, and its indices."""
 
@@ -124,7 +124,7 @@ class _Visible(_Replacing):
     """Replace `(radii > 0).nonzero()` and `radii > 0`."""
 
     def visit(self, node: ast.AST) -> ast.AST:
-        """Return the node, or what takes its place."""
+        """Return the node or its replacement."""
         match node:
             case ast.Call(func=ast.Attribute(ast.Compare() as compared, "nonzero"), args=[], keywords=[]):
                 radii = _above_zero(compared)
@@ -164,7 +164,7 @@ class _Indexed(_Replacing):
 
 
 def _filters(training: ast.FunctionDef) -> set[str]:
-    """Return the variables of a training function that are set to what its renderer has under `KEY`, or beside it."""
+    """Return the variables of a training function that are assigned in a statement that reads `KEY`."""
     statements = [node for node in ast.walk(training) if isinstance(node, ast.Assign)]
     setting = [node for node in statements if any(_is_key(part) for part in ast.walk(node.value))]
     return {name for node in setting for name in stored_names(node)}

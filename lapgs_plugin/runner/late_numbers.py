@@ -69,7 +69,7 @@ numbers.Real.register(LateNumber)  # loggers and progress bars ask for a number 
 
 
 def _computed(compute: Callable[[Any, Any], Any], first: Any, second: Any) -> Any:
-    """Return what is computed of two numbers, of which one is late; at once if the other is something else."""
+    """Return a result of two numbers of which one is late: late itself, unless the other is no number."""
     pending = sum(value.pending for value in (first, second) if isinstance(value, LateNumber))
     both = all(isinstance(value, (int, float, LateNumber)) for value in (first, second))
     if not both or pending > MOST_PENDING:
@@ -78,7 +78,7 @@ def _computed(compute: Callable[[Any, Any], Any], first: Any, second: Any) -> An
 
 
 def number(value: Any) -> Any:
-    """Return a late number once it is there, and everything else as it is."""
+    """Return a late number as a float, waiting for it; return any other value unchanged."""
     return float(value) if isinstance(value, LateNumber) else value
 
 
@@ -113,7 +113,7 @@ NAMES: dict[str, Callable[..., Any]] = {
 
 
 def reading_late(training: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a script's training function, which waits for the GPU no more where it reads what it only logs."""
+    """Return a script's training function, changed so that it does not wait for numbers that it only logs."""
 
     def late(tree: ast.FunctionDef) -> LateNumbers:
         change = LateNumbers(tree, parsed(Path(inspect.getfile(training))))

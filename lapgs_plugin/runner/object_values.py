@@ -47,7 +47,7 @@ def size_of(settings: Any) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class RasterOutputs:
-    """Hold what a rasterizer returned: an image, or an image among other outputs.
+    """Hold the outputs of a rasterizer: an image, or an image among others.
 
     Attributes:
         outputs: as the rasterizer returned them.

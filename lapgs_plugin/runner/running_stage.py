@@ -28,7 +28,7 @@ class RunningStage(TimedLoop):
 
     @abstractmethod
     def entered(self) -> AbstractContextManager[None]:
-        """Prepare the stage, act on exceptions of what runs inside, and release what the stage holds."""
+        """Prepare the stage, act on exceptions raised inside, and release its images and models."""
 
     @abstractmethod
     def scene_for(self, gaussians: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Initialise the checkout's model of a stage, and collect what the next stage's model inherits."""
+"""Initialise the checkout's model of a stage, and collect the state that the next stage's model inherits."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class StageModel:
         field, self._kept = self._run.inherited(self._before.field)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
-        # What else a fork knows of each point of the scene, it does not know of these.
+        # Other values that a fork has of each point of the scene are unknown here.
         count, known = len(points.points), fields_of(points).items()
         unknown = {
             name: np.zeros((len(positions), *value.shape[1:]), value.dtype)

@@ -69,7 +69,7 @@ class StageRendering:
         signed: whether the field is a residual.
         path: how signed colour is evaluated.
         views: the checkout's camera of each view by key.
-        images: targets I^l, what else the supervision needs, and weights of masks; None if nothing is trained.
+        images: targets I^l, other images of the supervision, and weights of masks; None if nothing is trained.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         masked: keys of the training views whose masks the loop's losses and scores have to honour.
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
@@ -184,7 +184,7 @@ class StageRendering:
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
         if self.images is not None and key in self.masked and not self.capture:
-            # Whatever the loop's loss is, it compares the target with itself outside of the mask.
+            # Outside of the mask any loss then compares the target with itself.
             image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
@@ -220,7 +220,7 @@ class StageRendering:
     def render_other(
         self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, called_at: str = "the checkout"
     ) -> Any:
-        """Return the outputs for colours that are not the model's, such as features or scores, as they are.
+        """Return the outputs for colours that are not the model's, such as features or scores, unchanged.
 
         Nothing of the photos belongs into such an image. Of a residual it is its own only, of which a warning tells.
 

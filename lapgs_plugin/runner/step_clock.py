@@ -95,7 +95,7 @@ def timing_replacements(profile: Profile, running: Callable[[], TimedLoop | None
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             if (loop := running()) is not None and loop.trains(gaussians):
-                loop.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
+                loop.iteration_begins(gaussians)  # the argument is ignored: some loops do not pass the iteration
             return original(gaussians, *args, **kwargs)
 
         return update_learning_rate

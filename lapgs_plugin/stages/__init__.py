@@ -1,1 +1,1 @@
-"""Hold what a stage is for any trainer: its run, its images, its measurements, joint training."""
+"""Hold the parts of a stage that every trainer needs: its run, its images, its measurements, joint training."""

@@ -61,7 +61,7 @@ class LoopCounts:
 
 @dataclass
 class LoopRecord:
-    """Measure a training loop, without the time of what is beside optimization.
+    """Measure a training loop; the time of anything but optimization is counted apart.
 
     Attributes:
         device: of training.
@@ -192,7 +192,7 @@ class StageRecord(LoopRecord):
         return sum(record.train_seconds for record in records if record.level != self.stage.level) + self.elapsed()
 
     def of_level(self, num_gaussians: int) -> LevelRecord:
-        """Return what the manifest says of the finished level, whose field has so many Gaussians."""
+        """Return the manifest's record of the finished level, whose field has `num_gaussians`."""
         stage, counts, before = self.stage, self.counts, self.memory_before
         return LevelRecord(
             level=stage.level,

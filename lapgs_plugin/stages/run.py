@@ -1,4 +1,4 @@
-"""Hold what the stages of a run share, whichever trainer trains them."""
+"""Hold the state that all stages of a run share, whichever trainer trains them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ CHECKPOINT_SECONDS = 60.0
 
 @dataclass
 class BetweenSteps:
-    """Do what the last step made due; none of it counts as optimization time.
+    """Log, measure, save and stop when due; none of it counts as optimization time.
 
     Attributes:
         evaluation: of the stage.
@@ -52,7 +52,7 @@ class BetweenSteps:
         due_sample = run.reached(self.samples)
         due_tick = run.passed(run.record.history_every)
         if due_test or due_sample or due_tick or stop.requested:
-            run.settle()  # so that the iterations in progress do not count as the time of what follows
+            run.settle()  # so that iterations in progress do not count as overhead
         measured = evaluation.held_out(due_test, due_sample and test_every is None)
         if due_sample and run.prepared.aside:
             evaluation.note_best()

@@ -146,7 +146,7 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
 
 
 def check_transforms(state: TransformsState | None, shape: torch.Size | None, name: str, path: Path) -> None:
-    """Check the state of what is learned of the training views.
+    """Check the state of the learned transforms of the training views.
 
     Args:
         state: from a checkpoint; None without transforms.

@@ -28,7 +28,7 @@ class StageEvaluation:
     Attributes:
         run: the stage.
         watch: compares the measurements of all stages.
-        monitor: shows what they say to the user.
+        monitor: shows warnings to the user.
         best: the stage's best state so far, see `checkpoint.BestState`; None before the first measurement.
     """
 
@@ -59,7 +59,7 @@ class StageEvaluation:
         """Return the PSNR in dB of a view, and after a colour fit.
 
         Args:
-            exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
+            exposure: (3, 4) colour transform from renders to the view's photo; None leaves renders unchanged.
         """
         run, level, below = self.run, self.run.stage.level, self.run.images.held_out
         camera = level_camera(view.camera, level)

@@ -198,7 +198,7 @@ def _share(model: TrainableField, chosen: Tensor) -> Tensor:
 
 
 def copies_of(opacities: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what equal Gaussians at one place need to look like a single one: equation 9 of Kheradmand et al. 2024.
+    """Return opacities and scales of equal Gaussians that together look like one: Kheradmand et al. 2024, equation 9.
 
     Its double sum is simplified by the sum of binomial coefficients C(i - 1, k) over i, which is C(N, k + 1).
 

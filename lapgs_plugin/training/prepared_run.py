@@ -1,4 +1,4 @@
-"""Hold a run of the built-in trainer that is ready to train: what was asked for, decided and checked."""
+"""Hold a run of the built-in trainer that is ready to train: its choices are decided and checked."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 
 @dataclass(frozen=True)
 class PreparedRun(StagedRun):
-    """Hold what all stages of a run share. `preparation.prepare` makes it from a request, `of` from a scene in memory.
+    """Hold a run that is ready to train. `preparation.prepare` makes it from a request, `of` from a scene in memory.
 
     Attributes:
         settings: of the run; the archive's manifest has the same.

@@ -1,4 +1,4 @@
-"""Decide what happens in which iteration of a stage. Imports no torch."""
+"""Schedule the events of a stage by iteration. Imports no torch."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
 
 @dataclass(frozen=True)
 class StageSchedule:
-    """Answer what is due in an iteration of one stage. It has no state.
+    """Tell which events are due in an iteration of one stage. It has no state.
 
     Iterations count from 1 in each stage. In a stage of n of N iterations, densification ends at `until` scaled by n/N,
     and the learning rate of positions decays to its last value at n; the other constants are the settings' own.

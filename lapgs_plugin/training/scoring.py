@@ -23,7 +23,7 @@ from lapgs_plugin.training.views import LevelView, shuffled
 
 @dataclass
 class FieldScoring:
-    """Render the field once more, also without colours, to see what each Gaussian does.
+    """Render the field once more, also without colours, to score its Gaussians.
 
     Attributes:
         rasterizer: renders the field.

@@ -105,7 +105,7 @@ class Strategy:
 
     @property
     def most(self) -> int | None:
-        """Most Gaussians of a stage, of what `of_stage` returned; None if there is no limit."""
+        """Limit on the Gaussians of a stage, of the result of `of_stage`; None without one."""
         return None
 
     def start(self, field: GaussianField, photos: int) -> GaussianField:
@@ -113,7 +113,7 @@ class Strategy:
         return field
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
-        """Return the density control of one stage. Called on what `of_stage` returned.
+        """Return the density control of one stage. Called on the result of `of_stage`.
 
         Args:
             schedule: of the stage.

@@ -102,7 +102,7 @@ class Trainer:
                 raise self._out_of_memory() from error
 
     def _say_what_is_chosen(self) -> None:
-        """Tell the user what the settings mean for this scene and device."""
+        """Tell the user the effect of the settings on this scene and device."""
         scene, say = self.prepared.scene, self.monitor.say
         settings = self.prepared.settings
         say(self._strategy_line())
