@@ -157,7 +157,7 @@ class ActiveStage(RunningStage):
             raise TrainingDivergedError(
                 f"pruning left no Gaussian at level {self.stage.level}, iteration {self.iteration} of "
                 f"{self.stage.iterations}; expected some whose opacity grew: give more --iterations, or options of "
-                f"{self._adapter.info.title} that prune less; finished levels ({self._archived_levels()}) are kept"
+                f"{self._adapter.info.title} that prune less; finished levels ({self._run.finished_levels}) are kept"
             )
         self._context.hooks.densified()
 
@@ -251,7 +251,7 @@ class ActiveStage(RunningStage):
         return DeviceMemoryError(
             f"out of GPU memory at level {self.stage.level} with {peak:,} Gaussians; images held on the "
             f"GPU: {images / 2**30:.2f} GiB; {help_}, more --levels or a smaller resolution too; "
-            f"finished levels ({self._archived_levels()}) are kept, --resume continues after them "
+            f"finished levels ({self._run.finished_levels}) are kept, --resume continues after them "
             f"[{first_line(error)}]"
         )
 
@@ -268,9 +268,6 @@ class ActiveStage(RunningStage):
         )
         if self._options.prune and self._prune_at is None:
             logger.warning("%s", unpruned_line(self._options.prune, self.stage.level))
-
-    def _archived_levels(self) -> str:
-        return ", ".join(map(str, self._archive.available_levels)) or "none"
 
     def _note_divergence(self, gaussians: Any, iteration: int) -> None:
         """Warn once if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
@@ -291,8 +288,8 @@ class ActiveStage(RunningStage):
             seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
             raise TrainingDivergedError(
                 f"training diverged at level {self.stage.level}, iteration {self.iteration} of "
-                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
-                "again with lower learning rates, or see whether `lapgs run --off` diverges too"
+                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._run.finished_levels}) are kept, "
+                "start again with lower learning rates, or see whether `lapgs run --off` diverges too"
             ) from error
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:

@@ -86,8 +86,8 @@ def _train_run(run: TrainingRun) -> Any:
         with run.image_cache():
             return _run_stages(run) if run.settings.has_residuals else SingleCall(run).train()
     except KeyboardInterrupt:
-        kept = ", ".join(map(str, archive.available_levels)) or "none"
-        logger.info("stopped; finished levels in %s: %s; --resume continues after them", run.folder, kept)
+        line = "stopped; finished levels in %s: %s; --resume continues after them"
+        logger.info(line, run.folder, run.finished_levels)
         raise
 
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,25 +19,12 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.object_values import RasterOutputs, fields_of, matrix_keys, size_of
 from lapgs_plugin.runner.signed_calls import with_signed_colors
 from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.stages.joint import Predictions
 
 logger = logging.getLogger(__name__)
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
-
-
-class Predictions(Protocol):
-    """Return upsampled predictions of coarser levels by view: cached images, or renders of finished fields."""
-
-    @property
-    def where(self) -> str:
-        """Where they wait, as `ImageStore.where`."""
-
-    def prefetch(self, key: str, /) -> None:
-        """Prepare for a `get` of this view."""
-
-    def get(self, key: str, /) -> Tensor:
-        """Return the prediction (3, h, w) on the device, float32, at the size of the finer level."""
 
 
 @dataclass(frozen=True)

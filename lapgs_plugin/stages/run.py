@@ -48,6 +48,11 @@ class StagedRun:
         """The target of residuals."""
         return SUPERVISIONS[self.settings.supervision]
 
+    @property
+    def finished_levels(self) -> str:
+        """The finished levels for messages, coarsest first."""
+        return ", ".join(map(str, self.archive.available_levels)) or "none"
+
     @contextmanager
     def image_cache(self) -> Iterator[None]:
         """Keep images on the disk inside; remove them at the end, and at the beginning those of a killed run."""

@@ -11,7 +11,7 @@ from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.monitor import Monitor, Tick
+from lapgs_plugin.training.monitor import Tick
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
@@ -23,8 +23,7 @@ class BetweenSteps:
     """Log, measure, save and stop when due; none of it counts as optimization time.
 
     Attributes:
-        evaluation: of the stage.
-        monitor: shows progress.
+        evaluation: of the stage; its monitor shows progress.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
@@ -33,7 +32,6 @@ class BetweenSteps:
     """
 
     evaluation: StageEvaluation
-    monitor: Monitor
     watcher: Watcher
     stop: StopRequest
     samples: Collection[int]
@@ -86,7 +84,7 @@ class BetweenSteps:
         )
         figures = {name: value for name, value in vars(tick).items() if value is not None}
         run.record.write_history(counts.iteration, figures)
-        self.monitor.tick(run.stage, tick)
+        self.evaluation.monitor.tick(run.stage, tick)
 
     def _checkpoint_is_due(self, run: StageRun) -> bool:
         if (every := run.prepared.control.checkpoint_every) is not None:

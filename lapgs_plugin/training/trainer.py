@@ -173,7 +173,6 @@ class Trainer:
                 self._say_if_nothing_is_visible(run)
             between_steps = BetweenSteps(
                 evaluation=evaluation,
-                monitor=self.monitor,
                 watcher=self.watcher,
                 stop=stop,
                 samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
