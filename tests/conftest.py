@@ -69,9 +69,11 @@ def _garbage_of_a_file() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _seeded_and_in_one_thread() -> None:
-    """On tensors this small, a second thread of PyTorch only spins."""
+def _seeded_and_in_one_thread(request: pytest.FixtureRequest) -> None:
+    """On tensors this small, a second thread of PyTorch only spins. Tests that are marked `gpu` need a GPU."""
     import torch  # not with this file, which the process that starts the others reads first
 
+    if request.node.get_closest_marker("gpu") and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
     torch.manual_seed(0)
     torch.set_num_threads(1)

@@ -24,15 +24,15 @@ from lapgs_plugin.errors import (
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
-from lapgs_plugin.runner.joint import JointLevels
-from lapgs_plugin.runner.loop_record import StageRecord
+from lapgs_plugin.runner.joint import JointModels
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_pruning import prune_least_visible, pruning_iteration
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
-from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
+from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
+from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class ActiveStage(RunningStage):
         before: result of the last of them; None for the base.
 
     Attributes:
-        returned: what the script's call returned, for its main block.
+        returned: result of the script's call, for its main block.
     """
 
     record: StageRecord
@@ -61,12 +61,20 @@ class ActiveStage(RunningStage):
         before: StageResult | None,
     ) -> None:
         self._views = StageViews(run, window.stage, call, None if before is None else before.predictions)
-        record = StageRecord(run.archive, window, run.context.parts, run.context.request.measuring.gpu_busy)
+        measuring = run.context.request.measuring
+        record = StageRecord(
+            archive=run.archive,
+            stage=window.stage,
+            iterations=window.total,
+            device=run.device,
+            profiled=window.stage.iterations if measuring.gpu_busy else 0,
+            breakdown=breakdown_on(run.device) if measuring.breakdown else Breakdown(),
+        )
         super().__init__(window.stage, self._views.rendering, record)
         self._context, self._run, self.window, self._finished, self._call = run.context, run, window, finished, call
         self._options, self._adapter, self._archive = run.settings, run.context.adapter, run.archive
         self._model = StageModel(run, self.stage, before)
-        self._joint: JointLevels | None = None
+        self._joint: JointModels | None = None
         self._joint_from = self._options.joint_from(self.stage)
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
@@ -93,7 +101,7 @@ class ActiveStage(RunningStage):
         finally:
             self._joint = self.gaussians = None
             self._views.close()
-            if self._context.device.type == "cuda":
+            if self._run.device.type == "cuda":
                 torch.cuda.empty_cache()
 
     @property
@@ -114,7 +122,7 @@ class ActiveStage(RunningStage):
         return scene
 
     def optimizers_made(self, gaussians: Any) -> None:
-        """Prepare the optimizers that the checkout has just set up, some in the middle of a stage again."""
+        """Prepare the optimizers that the checkout has just set up; some set them up again in the middle of a stage."""
         self._model.prepare_optimizers(gaussians, inherit=self.iteration == 0)
         if self._joint is not None:
             self._joint.follow(gaussians, self._options.color_factor)
@@ -123,7 +131,7 @@ class ActiveStage(RunningStage):
         iteration = self.iteration + 1
         self.record.start_clock()
         self._show(gaussians, iteration - 1)
-        self._context.parts.breakdown.mark("other")
+        self.record.breakdown.mark("other")
         every = self._context.request.measuring.test_every
         if every is not None and iteration > 1 and (iteration - 1) % every == 0 and self._views.test:
             elapsed = self.record.elapsed_in_run()
@@ -135,7 +143,8 @@ class ActiveStage(RunningStage):
             self._train_jointly(gaussians)
         count = len(gaussians._xyz) + self._joint_count
         self.record.count(iteration, count)
-        if self.record.write_progress(count) and self._diverged_at is None:
+        if iteration % self.record.history_every == 0:
+            self.record.write_history(iteration, {"elapsed": self.record.elapsed_in_run(), "num_gaussians": count})
             self._note_divergence(gaussians, iteration - 1)
 
     def densified(self, gaussians: Any) -> None:
@@ -148,7 +157,7 @@ class ActiveStage(RunningStage):
             raise TrainingDivergedError(
                 f"pruning left no Gaussian at level {self.stage.level}, iteration {self.iteration} of "
                 f"{self.stage.iterations}; expected some whose opacity grew: give more --iterations, or options of "
-                f"{self._adapter.info.title} that prune less; finished levels ({self._archived_levels()}) are kept"
+                f"{self._adapter.info.title} that prune less; finished levels ({self._run.finished_levels}) are kept"
             )
         self._context.hooks.densified()
 
@@ -167,6 +176,7 @@ class ActiveStage(RunningStage):
         """Announce the stage and start its measurements."""
         self._log_start()
         self.record.start()
+        self.record.rewind_history()
         self._context.hooks.on_stage_start(self.stage)
         self._context.request.watcher.stage_started(self.stage)
 
@@ -196,19 +206,19 @@ class ActiveStage(RunningStage):
         Raises:
             LapgsError: training left nothing to archive, or NaN or inf.
         """
-        gaussians, self.gaussians = self.gaussians, None  # what fails from here on is not archived again
-        self.record.stop(self._views.bytes_on_device)
+        gaussians, self.gaussians = self.gaussians, None  # an error from here on does not archive it again
+        self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)
         joint = None if self._joint is None else self._joint.fields(self._exported)
         self._require_finite({self.stage.level: field, **(joint or {})})
         inherited = {"carried": self._model.carried(gaussians), "moments": self._model.moments(gaussians)}
         result = self._result(gaussians, field, **inherited)
-        self.record.archive(field, inherited, joint)
+        inherits = self.stage.level > 0 and any(inherited.values())
+        self._archive.finish_level(self.record.of_level(len(field)), field, inherited if inherits else None, joint)
         if self._views.test and (self.stage.level <= 1 or self._context.request.measuring.test_every is not None):
             self._evaluate(gaussians)
-        psnr = last_psnr(self._archive.history()) if self.stage.level == 0 else {}
-        for line in weak_levels(self._archive.manifest.records[-1:], psnr):
+        for line in self.record.weak_lines():
             logger.warning("%s", line)
         self._compare(gaussians, field)
         self._context.request.watcher.stage_finished(self.stage, lambda: self._fields(gaussians))
@@ -222,47 +232,52 @@ class ActiveStage(RunningStage):
         self.finish()
         logger.warning(
             "%s() failed after it had trained level %d, which is in the run folder (%s)",
-            *(self._call.function.__name__, self.stage.level, typed_line(error)),
+            self._call.function.__name__,
+            self.stage.level,
+            typed_line(error),
         )
 
     def restore(self) -> StageResult:
         """Return the result of this stage from its archived field."""
         field = self._archive.field(self.stage.level)
-        gaussians = self._adapter.model_of(self._run.call, field.to(self._context.device))
+        gaussians = self._adapter.model_of(self._run.call, field.to(self._run.device))
         return self._result(gaussians, field, *self._model.load_inherited(self._archive))
 
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         """Return the error for a full GPU: one line with its contents and what helps."""
-        images = self._views.bytes_on_device
+        images = self._views.images.bytes_on_device
         help_ = "--images-on memory takes them off the GPU" if images else "a larger threshold for densification helps"
+        peak = self.record.counts.peak_gaussians
         return DeviceMemoryError(
-            f"out of GPU memory at level {self.stage.level} with {self.record.peak:,} Gaussians; images held on the "
+            f"out of GPU memory at level {self.stage.level} with {peak:,} Gaussians; images held on the "
             f"GPU: {images / 2**30:.2f} GiB; {help_}, more --levels or a smaller resolution too; "
-            f"finished levels ({self._archived_levels()}) are kept, --resume continues after them "
+            f"finished levels ({self._run.finished_levels}) are kept, --resume continues after them "
             f"[{first_line(error)}]"
         )
 
     def _log_start(self) -> None:
         width, height = self.stage.image_size
-        place = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.targets.where]
+        where = {"gpu": "GPU", "memory": "CPU", "disk": "disk"}[self._views.images.photos.targets.where]
         logger.info(
             "level %d: %d iterations at %dx%d, images on the %s",
-            *(self.stage.level, self.stage.iterations, width, height, place),
+            self.stage.level,
+            self.stage.iterations,
+            width,
+            height,
+            where,
         )
         if self._options.prune and self._prune_at is None:
             logger.warning("%s", unpruned_line(self._options.prune, self.stage.level))
 
-    def _archived_levels(self) -> str:
-        return ", ".join(map(str, self._archive.available_levels)) or "none"
-
     def _note_divergence(self, gaussians: Any, iteration: int) -> None:
-        """Warn if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
-        if bool(torch.isfinite(gaussians._xyz.detach()).all()):
+        """Warn once if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
+        if self._diverged_at is not None or bool(torch.isfinite(gaussians._xyz.detach()).all()):
             return
         self._diverged_at = iteration
         logger.warning(
             "level %d has positions of NaN or inf after iteration %d; while it has, it cannot be archived",
-            *(self.stage.level, iteration),
+            self.stage.level,
+            iteration,
         )
 
     def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
@@ -273,8 +288,8 @@ class ActiveStage(RunningStage):
             seen = "" if self._diverged_at is None else f", first seen after iteration {self._diverged_at}"
             raise TrainingDivergedError(
                 f"training diverged at level {self.stage.level}, iteration {self.iteration} of "
-                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._archived_levels()}) are kept, start "
-                "again with lower learning rates, or see whether `lapgs run --off` diverges too"
+                f"{self.stage.iterations}{seen}: {error}; finished levels ({self._run.finished_levels}) are kept, "
+                "start again with lower learning rates, or see whether `lapgs run --off` diverges too"
             ) from error
 
     def _fields(self, gaussians: Any) -> dict[int, GaussianField]:
@@ -294,18 +309,18 @@ class ActiveStage(RunningStage):
                 watcher.look(self.stage, iteration, lambda: self._fields(gaussians), lambda: False)
 
     def _prune(self, gaussians: Any) -> None:
-        self._context.parts.breakdown.mark("densification")
+        self.record.breakdown.mark("densification")
         prune_least_visible(self._views, gaussians, self._options.prune, self._run.color_path)
-        self._context.parts.breakdown.mark("other")
+        self.record.breakdown.mark("other")
 
     def _train_jointly(self, gaussians: Any) -> None:
         """Optimize the finished fields, too, and render them instead of reading their predictions."""
-        self.record.note_memory(self._views.bytes_on_device)
-        self._views.drop_predictions()
-        self._joint = JointLevels(self._run, self._finished, self._views)
+        self.record.note_memory(self._views.images.bytes_on_device)
+        self._views.images.drop_predictions()
+        self._joint = JointModels(self._run, self._finished, self._views)
+        self._views.predict_jointly(self._joint.predictions())
         self._joint.follow(gaussians, self._options.color_factor)
         self._joint_count = sum(record.num_gaussians for record in self._archive.manifest.records)
-        self.rendering.accumulated = self._joint
 
     def _evaluate(self, gaussians: Any) -> None:
         """Measure the held-out views of the archived level; a failure costs no more than the measurement."""
@@ -318,11 +333,12 @@ class ActiveStage(RunningStage):
             logger.warning(
                 "held-out views of level %d could not be measured (%s); the level is in the run folder, and `lapgs "
                 "eval` measures the run",
-                *(self.stage.level, typed_line(error)),
+                self.stage.level,
+                typed_line(error),
             )
 
     def _compare(self, gaussians: Any, field: GaussianField) -> None:
-        """Compare the archived field with what the checkout renders by now: some quantize or filter late in a run."""
+        """Compare the archived field with the checkout's own render of it: some quantize or filter late in a run."""
         if self.stage.level > 0 and self._options.nested:
             return
         rendering = StageRendering(self.stage.signed, self._run.color_path, self._views.cameras, capture=True)
@@ -334,7 +350,7 @@ class ActiveStage(RunningStage):
     def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
         """Write the quality of the held-out views after an iteration to the history."""
         quality = self._views.held_out_quality(gaussians)
-        self.record.write_quality(iteration, quality, elapsed)
+        self.record.write_history(iteration, {**({} if elapsed is None else {"elapsed": elapsed}), **quality})
         logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._views.test))
 
     def _result(self, gaussians: Any, field: GaussianField, carried: Any, moments: Any) -> StageResult:

@@ -1,4 +1,4 @@
-"""Compare what a checkout's rasterizer gets for a model with the field that is archived of it."""
+"""Compare a rasterizer's inputs for a checkout's model with the archived field of that model."""
 
 from __future__ import annotations
 
@@ -34,16 +34,17 @@ def explain_other_values(adapter: BackboneAdapter, captured: Captured, field: Ga
         captured: its rasterizer and the inputs that it got for the model.
         field: the field that is archived of the model.
     """
-    found = []
+    differences = []
     if names := " and ".join(_other_values(captured, field)):
-        found.append(f"other {names} than its model has as parameters, from which fields are archived")
+        differences.append(f"other {names} than its model has as parameters, from which fields are archived")
     if names := " and ".join(_values_beside(captured, field)):
-        found.append(f"with {names}, values of each Gaussian that fields do not have")
-    return f"{adapter.profile.source.model[1]}: the checkout renders {', and '.join(found)}" if found else ""
+        differences.append(f"with {names}, values of each Gaussian that fields do not have")
+    model = adapter.profile.source.model[1]
+    return f"{model}: the checkout renders {', and '.join(differences)}" if differences else ""
 
 
 def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
-    """Yield what is rendered otherwise than the field has it, activated or as its parameters."""
+    """Yield the kinds of values that are rendered and differ from the field's, activated or as parameters."""
     logits = field.opacity_logits[:, None]
     archived = (
         ("positions", "means3D", (field.means,)),
@@ -54,36 +55,36 @@ def _other_values(captured: Captured, field: GaussianField) -> Iterator[str]:
     inputs = dict(captured.inputs)
     if isinstance(dc := inputs.get("dc"), Tensor) and isinstance(rest := inputs.get("shs"), Tensor):
         inputs["shs"] = torch.cat([dc, rest], dim=1)
-    for what, name, values in archived:
-        given = [inputs.get(name)]
-        if what == "opacities" and isinstance(given[0], Tensor):
-            given.append(given[0].clamp(max=1))  # as those above 1 are archived, of which a warning tells
-        if not any(_alike(each, value) for each in given for value in values):
-            yield what
+    for kind, name, values in archived:
+        rendered = [inputs.get(name)]
+        if kind == "opacities" and isinstance(rendered[0], Tensor):
+            rendered.append(rendered[0].clamp(max=1))  # as those above 1 are archived, of which a warning tells
+        if not any(_alike(shown, value) for shown in rendered for value in values):
+            yield kind
     if _has_other_colors(captured, field):
         yield "colours"
 
 
 def _has_other_colors(captured: Captured, field: GaussianField) -> bool:
     """Return whether the renderer evaluates colours that are not those of the field's SH, as by a network."""
-    given = captured.inputs.get("colors_precomp")
-    if not isinstance(given, Tensor) or given.shape != field.means.shape:
+    colors = captured.inputs.get("colors_precomp")
+    if not isinstance(colors, Tensor) or colors.shape != field.means.shape:
         return False
-    field = field.to(given.device)
+    field = field.to(colors.device)
     if (seen := seen_from(captured.settings, field.means)) is None:
         return False
     directions, degree = seen[0], min(int(seen[1]), field.sh_degree)
     expected = (sh_to_color(field.sh, directions, degree, signed=signed) for signed in (False, True))
-    return not any(torch.allclose(given.detach(), each, rtol=SAME_VALUE, atol=SAME_VALUE) for each in expected)
+    return not any(torch.allclose(colors.detach(), color, rtol=SAME_VALUE, atol=SAME_VALUE) for color in expected)
 
 
-def _alike(given: object, value: Tensor) -> bool:
+def _alike(rendered: object, value: Tensor) -> bool:
     """Return whether an input of a rasterizer has the values of a field; True if it cannot be compared."""
-    if not isinstance(given, Tensor) or given.ndim != value.ndim or len(given) != len(value):
+    if not isinstance(rendered, Tensor) or rendered.ndim != value.ndim or len(rendered) != len(value):
         return True
-    axes = min(given.shape[1], value.shape[1])  # flat Gaussians have two scales, and get a third one in fields
-    value = value.to(given.device)
-    return torch.allclose(given[:, :axes].detach(), value[:, :axes], rtol=SAME_VALUE, atol=SAME_VALUE**2)
+    axes = min(rendered.shape[1], value.shape[1])  # flat Gaussians have two scales, and get a third one in fields
+    value = value.to(rendered.device)
+    return torch.allclose(rendered[:, :axes].detach(), value[:, :axes], rtol=SAME_VALUE, atol=SAME_VALUE**2)
 
 
 @torch.no_grad()
@@ -93,6 +94,6 @@ def _values_beside(captured: Captured, field: GaussianField) -> Iterator[str]:
         if not (isinstance(value, Tensor) and value.is_floating_point() and value.shape[:1] == (len(field),)):
             continue
         if value.numel() == len(field) and not any(part in name for part in OF_FIELDS):
-            image, plain = (captured.repeated(**{name: each}) for each in (value, torch.ones_like(value)))
+            image, plain = (captured.repeated(**{name: values}) for values in (value, torch.ones_like(value)))
             if not torch.allclose(image, plain, rtol=SAME_VALUE, atol=SAME_VALUE):
                 yield name

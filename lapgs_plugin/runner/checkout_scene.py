@@ -84,13 +84,15 @@ class CheckoutScene:
         points = torch.as_tensor(np.asarray(self.points.points)).float()  # (n, 3)
         require_places(points, "the scene has")
         seen = [_depths_in_view(camera, some_of(points)) for camera in self.train]
-        near, ahead = sum(int((each <= NEAR_DEPTH).sum()) for each in seen), sum(map(len, seen))
+        near, ahead = sum(int((depths <= NEAR_DEPTH).sum()) for depths in seen), sum(map(len, seen))
         if 2 * near > ahead:
             factor = 10.0 ** math.ceil(math.log10(NEAR_DEPTH / float(torch.cat(seen).median())) + 1)
             logger.warning(
                 "%d %% of the points in view are nearer to the cameras than %g, the near plane of 3DGS rasterizers, "
                 "which draw nothing there; `lapgs train` takes scenes of any size, or scale poses and points by %g",
-                *(100 * near // ahead, NEAR_DEPTH, factor),
+                100 * near // ahead,
+                NEAR_DEPTH,
+                factor,
             )
         dark = [camera for camera, depths in zip(self.train, seen, strict=True) if not (depths > NEAR_DEPTH).any()]
         dark = [camera for camera in dark if not (_depths_in_view(camera, points) > NEAR_DEPTH).any()]
@@ -98,7 +100,9 @@ class CheckoutScene:
             logger.warning(
                 "no Gaussian will be visible at first in %d of %d training views, such as %s; check that the points "
                 "and the cameras are of one model",
-                *(len(dark), len(seen), dark[0].image_name),
+                len(dark),
+                len(seen),
+                dark[0].image_name,
             )
 
     def copy(self, gaussians: Any, model_path: str, train: list[Any], test: list[Any]) -> Any:
@@ -130,5 +134,5 @@ def _depths_in_view(camera: Any, points: Tensor) -> Tensor:
     x, y, depths = local.unbind(1)
     tangents = [math.tan(getattr(camera, name, math.pi / 2) / 2) for name in ("FoVx", "FoVy")]
     # Gaussians that are centred a little outside of the image reach into it.
-    inside = [each.abs() < JACOBIAN_LIMIT * tangent * depths for each, tangent in zip((x, y), tangents, strict=True)]
+    inside = [axis.abs() < JACOBIAN_LIMIT * tangent * depths for axis, tangent in zip((x, y), tangents, strict=True)]
     return depths[(depths > 0) & inside[0] & inside[1]]

@@ -74,9 +74,9 @@ def _difference(original: Callable[..., Any], device: torch.device) -> float:
     other = torch.rand(3, 29, 43, generator=generator)
     image = (other + 0.2 * torch.rand(3, 29, 43, generator=generator)).to(device).requires_grad_()
     other = other.to(device)
-    found = []
+    results = []
     for value in (_our_ssim(image, other), original(image.double(), other.double())):
         (gradient,) = torch.autograd.grad(value, image)
-        found.append((value.detach(), gradient))
-    (ours, our_gradient), (theirs, their_gradient) = found
+        results.append((value.detach(), gradient))
+    (ours, our_gradient), (theirs, their_gradient) = results
     return largest([(ours - theirs).abs(), (our_gradient - their_gradient).abs() / their_gradient.abs().max()])

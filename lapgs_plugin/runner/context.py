@@ -33,10 +33,10 @@ from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
+from lapgs_plugin.stages.run import StagedRun
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +75,7 @@ class CheckoutContext:
         request: what the user asks for.
 
     Attributes:
+        images: photos of the scene.
         stages: hold the running stage, or that of the dry run.
         began: file-system time (ns) just before the main block.
     """
@@ -82,7 +83,7 @@ class CheckoutContext:
     def __init__(self, request: RunRequest) -> None:
         self.request, self.adapter, self.device = request, request.adapter, torch.device(request.device)
         self.images, self.stages = SceneImages(), Stages()
-        self.parts = IterationParts(self.device, request.measuring.breakdown)
+        self.parts = IterationParts(self.stages, request.measuring.breakdown)
         visibility = EarlyVisibility() if request.settings.run_ahead else None
         ours = {} if request.compiled is None else request.compiled.beside
         self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, visibility, ours)
@@ -137,28 +138,26 @@ class CheckoutContext:
 
 
 @dataclass(frozen=True)
-class TrainingRun:
+class TrainingRun(StagedRun):
     """Hold a run that is ready to train, once the script has called `training`. `preparation.prepare` makes it.
 
     Attributes:
         settings: those of the request, with the defaults for the photos' size.
+        context: the objects from before the script's main block.
         call: for the whole run.
-        plan: the stages.
+        scene: of the checkout.
         schedule: of the script's training function.
         color_path: how the checkout's rasterizer evaluates signed colour.
-        archive: the run folder, open for writing.
         folder: its path as the user typed it.
         scene_files: folder of the files that the checkout's Scene wrote beside a model, for its viewers.
     """
 
-    context: CheckoutContext
     settings: RunSettings
+    context: CheckoutContext
     call: TrainingCall
     scene: CheckoutScene
-    plan: StagePlan
     schedule: Schedule
     color_path: ColorPath
-    archive: RunArchive
     folder: Path
     scene_files: Path
 

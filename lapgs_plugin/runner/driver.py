@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from lapgs_plugin.runner.preparation import prepare
 from lapgs_plugin.runner.replacements import StageReplacements
 from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.step_clock import counting_steps
-from lapgs_plugin.runs.layout import CACHE
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +60,7 @@ class HierarchyDriver:
         return self._folder
 
     def _train(self, call: TrainingCall) -> Any:
-        """Train the hierarchy in place of the script's call of `training`, and return what its last call returned."""
+        """Train the hierarchy in place of the script's call of `training`, and return the result of its last call."""
         profile = self._context.adapter.profile
         if len(profile.source.models) > 1:
             with undisturbed(self._context.device):
@@ -79,29 +77,27 @@ class HierarchyDriver:
 
 
 def _train_run(run: TrainingRun) -> Any:
-    """Train the stages that are not in the archive, and return what the script's last call returned."""
+    """Train the stages that are not in the archive, and return the result of the script's last call."""
     context, archive = run.context, run.archive
     context.request.watcher.run_started(archive)
     try:
         acts = "; ".join(run.schedule.describe(run.call.variables)) or "nowhere"
         logger.info("%s acts by iteration: %s", context.adapter.script.path.name, acts)
-        return _run_stages(run) if run.settings.has_residuals else SingleCall(run).train()
+        with run.image_cache():
+            return _run_stages(run) if run.settings.has_residuals else SingleCall(run).train()
     except KeyboardInterrupt:
-        kept = ", ".join(map(str, archive.available_levels)) or "none"
-        logger.info("stopped; finished levels in %s: %s; --resume continues after them", run.folder, kept)
+        line = "stopped; finished levels in %s: %s; --resume continues after them"
+        logger.info(line, run.folder, run.finished_levels)
         raise
-    finally:
-        # A run that is continued makes its images again.
-        shutil.rmtree(archive.path(CACHE), ignore_errors=True)
 
 
 def _run_stages(run: TrainingRun) -> Any:
-    """Train or restore all stages, each by a call of its own length, and return what the last call returned."""
+    """Train or restore all stages, each by a call of its own length, and return the result of the last one."""
     adapter, finished = run.context.adapter, list[FinishedStage]()
     before: StageResult | None = None
     for stage in run.plan:
         window = run.context.window(run.plan, stage)
-        # Arguments are the adapter's to change, all else is what the script's tree says.
+        # The adapter changes arguments; the rest follows from the script's syntax tree.
         call = adapter.stage_call(run.call, window, str(run.archive.path(f"level_{stage.level}")))
         changed = run.schedule.for_stage(run.call.variables, call.values, window, adapter.info.unscaled)
         if changed.notes:

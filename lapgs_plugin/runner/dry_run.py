@@ -11,7 +11,7 @@ import logging
 import random
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -32,17 +32,19 @@ from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import LapgsError, UserInputError, first_line, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, explain_fallback
 from lapgs_plugin.runner.archived_values import NESTED_WORKS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext
-from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.rasterizer_choice import Decision, decide
 from lapgs_plugin.runner.rasterizer_trial import RasterizerCall, trials_of
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runner.step_clock import CLOCK
+from lapgs_plugin.stages.joint import RenderedPredictions
+from lapgs_plugin.stages.record import LoopRecord
 
 logger = logging.getLogger(__name__)
 
@@ -93,10 +95,9 @@ class DryRun:
         """
         works = NESTED_MAY_WORK if self._stage.signed else OFF
         with undisturbed(self._context.device), _silent_writer(self._adapter.train):
-            sizes = {key: level_size(self._context.images[key].size, self._stage.level) for key in self._cameras}
             rendering = StageRendering(self._stage.signed, path, self._cameras)
             if self._stage.signed:
-                rendering.accumulated = _Nothing(sizes, self._context.device)
+                rendering.accumulated = self._black_predictions()
                 rendering.composed = frozenset(self._cameras)
             call = self._scratch_call(folder)
             stage = _DryStage(self._stage, rendering, call, self._scene_for)
@@ -223,6 +224,16 @@ class DryRun:
         train, test = ([self._view(camera) for camera in cameras] for cameras in (self._scene.train, self._scene.test))
         gaussians.create_from_pcd(_some(self._scene.points), *self._scene.others)
         return self._scene.copy(gaussians, call.dataset.model_path, train, test)
+
+    def _black_predictions(self) -> RenderedPredictions:
+        """Return black images as predictions by the coarser level."""
+        sizes, coarser = {key: self._context.images[key].size for key in self._cameras}, self._stage.level + 1
+
+        def black(level: int, keys: Sequence[str]) -> Tensor:
+            width, height = level_size(sizes[keys[0]], level)
+            return torch.zeros(3, height, width, device=self._context.device)
+
+        return RenderedPredictions((coarser,), black, sizes, Pyramid(self._context.request.settings.grid))
 
     def _view(self, camera: Any, stage: Stage | None = None) -> Any:
         """Return a camera at the level of a stage, by default the tried one."""
@@ -408,22 +419,6 @@ class _DryStage(RunningStage):
         if self.iteration:
             raise _Enough
         self.record.count(1, gaussians=0)
-
-
-class _Nothing:
-    """Return black images as predictions of coarser levels."""
-
-    where = "gpu"  # nothing has to be copied
-
-    def __init__(self, sizes: Mapping[str, tuple[int, int]], device: torch.device) -> None:
-        self._sizes, self._device = sizes, device
-
-    def prefetch(self, key: str) -> None:
-        """Do nothing."""
-
-    def get(self, key: str) -> Tensor:
-        width, height = self._sizes[key]
-        return torch.zeros(3, height, width, device=self._device)
 
 
 def _some(points: Any) -> Any:

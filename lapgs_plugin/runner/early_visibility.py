@@ -23,11 +23,11 @@ from lapgs_plugin.checkouts.syntax import stored_names
 logger = logging.getLogger(__name__)
 
 VISIBLE, MASK, INDEX = "_lapgs_visible", "_lapgs_mask", "_lapgs_index"
-"""Names of what takes the place of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
+"""Names of the replacements of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
 COUNTED = "num_rendered"
 """Attribute in which the family's rasterizers keep the number of pairs for their backward pass."""
 KEY = "visibility_filter"
-"""Name of the mask or the indices among what the family's renderers return."""
+"""Name of the mask or the indices in the results of the family's renderers."""
 PROJECTED, RADII, INDICES = "_lapgs_projected", "_lapgs_radii", "_lapgs_indices"
 """Attributes of radii that are there, which holds their version; of a mask: its radii, and its indices."""
 
@@ -56,36 +56,36 @@ class EarlyVisibility:
 
     def in_statistics(self, method: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that indexes by the indices of the masks that it is called with."""
-        return rewritten(method, lambda tree: _Indexed({each.arg for each in tree.args.args}), {INDEX: self.index})
+        return rewritten(method, lambda tree: _Indexed({node.arg for node in tree.args.args}), {INDEX: self.index})
 
     def note(self, outputs: Any) -> None:
         """Note the radii among the outputs of a rasterizer that has counted its pairs."""
-        found = [each for each in outputs if isinstance(each, Tensor)] if isinstance(outputs, tuple) else []
-        if any(type(getattr(each.grad_fn, COUNTED, None)) is int for each in found):
-            for each in found:
-                if each.ndim == 1 and each.dtype == torch.int32 and each.is_cuda:
-                    setattr(each, PROJECTED, each._version)
+        tensors = [tensor for tensor in outputs if isinstance(tensor, Tensor)] if isinstance(outputs, tuple) else []
+        if any(type(getattr(tensor.grad_fn, COUNTED, None)) is int for tensor in tensors):
+            for tensor in tensors:
+                if tensor.ndim == 1 and tensor.dtype == torch.int32 and tensor.is_cuda:
+                    setattr(tensor, PROJECTED, tensor._version)
 
     def indices(self, radii: Any) -> Any:
         """Return `(radii > 0).nonzero()`."""
         if not (self._works and _is_noted(radii)):
             return (radii > 0).nonzero()
-        found = self._found_early(radii)
+        early = self._found_early(radii)
         if self._compared < COMPARED:
             self._compared += 1
             waited_for = (radii > 0).nonzero()
-            if not torch.equal(found, waited_for):
+            if not torch.equal(early, waited_for):
                 self._works = False
                 logger.warning("visible Gaussians are waited for: this rasterizer counts before its radii are there")
                 return waited_for
-        return found
+        return early
 
     def mask(self, radii: Any) -> Any:
         """Return `radii > 0`."""
-        found = radii > 0
+        mask = radii > 0
         if self._works and _is_noted(radii):
-            setattr(found, RADII, radii)
-        return found
+            setattr(mask, RADII, radii)
+        return mask
 
     def index(self, mask: Any) -> Any:
         """Return a mask, or its indices (k,) if they are found early."""
@@ -101,9 +101,9 @@ class EarlyVisibility:
             # Ahead of the blocks of other work that wait.
             self._stream = torch.cuda.Stream(radii.device, priority=-1)  # type: ignore[no-untyped-call]  # torch's
         with torch.cuda.stream(self._stream):
-            found = (radii > 0).nonzero()  # waits for this stream
-        found.record_stream(torch.cuda.current_stream(radii.device))
-        return found
+            indices = (radii > 0).nonzero()  # waits for this stream
+        indices.record_stream(torch.cuda.current_stream(radii.device))
+        return indices
 
 
 def _is_noted(radii: Any) -> bool:
@@ -124,7 +124,7 @@ class _Visible(_Replacing):
     """Replace `(radii > 0).nonzero()` and `radii > 0`."""
 
     def visit(self, node: ast.AST) -> ast.AST:
-        """Return the node, or what takes its place."""
+        """Return the node or its replacement."""
         match node:
             case ast.Call(func=ast.Attribute(ast.Compare() as compared, "nonzero"), args=[], keywords=[]):
                 radii = _above_zero(compared)
@@ -164,9 +164,9 @@ class _Indexed(_Replacing):
 
 
 def _filters(training: ast.FunctionDef) -> set[str]:
-    """Return the variables of a training function that are set to what its renderer has under `KEY`, or beside it."""
+    """Return the variables of a training function that are assigned in a statement that reads `KEY`."""
     statements = [node for node in ast.walk(training) if isinstance(node, ast.Assign)]
-    setting = [node for node in statements if any(_is_key(each) for each in ast.walk(node.value))]
+    setting = [node for node in statements if any(_is_key(part) for part in ast.walk(node.value))]
     return {name for node in setting for name in stored_names(node)}
 
 

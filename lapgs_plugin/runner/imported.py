@@ -37,7 +37,7 @@ from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.rendering.hierarchy_renderer import CLAMPED
 from lapgs_plugin.runner.manifest import scene_reference
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import exists
+from lapgs_plugin.runs.layout import exists, require_room
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, PathText
 from lapgs_plugin.runs.results import read_bare_record
 from lapgs_plugin.scenes import smallest_size
@@ -135,16 +135,16 @@ def read_foreign_run(folder: Path, iteration: int | None = None) -> ForeignRun:
             f"{folder} was trained with --train_test_exp, whose exposure of each image is no part of a field; "
             "expected a run without it"
         )
-    places = {int(path.name[1:]): path for path in folder.glob("L*") if re.fullmatch(r"L[0-9]{1,2}", path.name)}
-    trained = {level: path for level, path in places.items() if (path / "point_cloud").is_dir()}
+    folders = {int(path.name[1:]): path for path in folder.glob("L*") if re.fullmatch(r"L[0-9]{1,2}", path.name)}
+    trained = {level: path for level, path in folders.items() if (path / "point_cloud").is_dir()}
     if not trained and (folder / "point_cloud").is_dir():
         trained = {0: folder}
-    expected = list(range(max(places, default=0), -1, -1))[: len(trained)]
+    expected = list(range(max(folders, default=0), -1, -1))[: len(trained)]
     if not trained or sorted(trained, reverse=True) != expected:
-        found = ", ".join(f"L{level}" for level in sorted(trained, reverse=True)) or "no point_cloud folder"
+        contents = ", ".join(f"L{level}" for level in sorted(trained, reverse=True)) or "no point_cloud folder"
         raise RunFolderError(
-            f"{folder} holds {found}, expected point_cloud/, or L<n>/point_cloud/ of the coarsest level and of those "
-            "below it without gaps; give the folder that training wrote with -m"
+            f"{folder} holds {contents}, expected point_cloud/, or L<n>/point_cloud/ of the coarsest level and of "
+            "those below it without gaps; give the folder that training wrote with -m"
         )
     is_hierarchy = trained[expected[0]] != folder
     breakdown: dict[str, Any] = {}
@@ -170,9 +170,9 @@ def read_cfg_args(path: Path) -> dict[str, Any]:
         RunFolderError: it is missing or something else, or lacks an option.
     """
     if not exists(path):
-        what = f"{path.parent} is a file" if path.parent.is_file() else f"{path} does not exist"
+        problem = f"{path.parent} is a file" if path.parent.is_file() else f"{path} does not exist"
         raise RunFolderError(
-            f"{what}; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
+            f"{problem}; expected a folder that a 3DGS codebase or the paper authors' release wrote with -m"
         )
     text = read_text(path, error=RunFolderError, advice=COPY)
     try:
@@ -223,7 +223,7 @@ def import_run(
         untold = f"--backbone (not given): {run.folder} does not say which backbone trained it"
         raise UserInputError(f"{untold if name is None else f'--backbone {name}'}, expected one of {', '.join(known)}")
     backbone = BACKBONES[name]
-    RunArchive.require_room(out, overwrite)
+    require_room(out, overwrite)
     recorded = {name: value for name, value in run.options.items() if _is_raster_option(name, value)}
     settings = {**backbone.info.raster_defaults, **recorded, **_checked(settings or {})}
     manifest = _manifest(run, backbone.info, scene, settings)
@@ -269,24 +269,25 @@ def _as_recorded(record: LevelRecord, noted: Mapping[str, Any]) -> LevelRecord:
     )
 
 
-def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
+def _level(level: int, folder: Path, iteration: int | None) -> ForeignLevel:
     saved = {
         int(path.parent.name.removeprefix("iteration_")): path
-        for path in (place / "point_cloud").glob("iteration_*/point_cloud.ply")
+        for path in (folder / "point_cloud").glob("iteration_*/point_cloud.ply")
         if re.fullmatch(r"iteration_0*[1-9][0-9]{0,8}", path.parent.name)
     }
     if not saved:
         raise RunFolderError(
-            f"{place / 'point_cloud'} holds no iteration_<n>/point_cloud.ply; expected the folder of a finished "
+            f"{folder / 'point_cloud'} holds no iteration_<n>/point_cloud.ply; expected the folder of a finished "
             "training"
         )
     chosen = max(saved) if iteration is None else iteration
     if chosen not in saved:
-        found = ", ".join(map(str, sorted(saved)))
+        iterations = ", ".join(map(str, sorted(saved)))
         raise RunFolderError(
-            f"{place / 'point_cloud'} holds fields of iterations {found}, expected {iteration}; choose with --iteration"
+            f"{folder / 'point_cloud'} holds fields of iterations {iterations}, expected {iteration}; choose with "
+            "--iteration"
         )
-    info = place / TRAIN_INFO
+    info = folder / TRAIN_INFO
     text = read_text(info, error=RunFolderError, advice=COPY) if exists(info) else ""
     seconds = re.search(r"Training Time: ([0-9]{1,12}(?:\.[0-9]{1,6})?) seconds", text)
     peak = re.search(r"Peak GS number: ([0-9]{1,12})\b", text)
@@ -297,7 +298,8 @@ def _level(level: int, place: Path, iteration: int | None) -> ForeignLevel:
 
 def _recognised(options: Mapping[str, Any], record: Mapping[str, Any], breakdown: Mapping[str, Any]) -> str | None:
     """Return the backbone as we recorded it, by options that only it has, or as the release noted it; else None."""
-    by_options = [each.info for each in all_adapters() if any(name in options for name in each.info.telling_options)]
+    infos = [adapter.info for adapter in all_adapters()]
+    by_options = [info for info in infos if any(name in options for name in info.telling_options)]
     told = (record.get("backbone"), *(info.name for info in by_options), breakdown.get("backbone"))
     return next((name for name in told if name in list(BACKBONES)), None)
 

@@ -24,33 +24,31 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.profile import Profile
-from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
+from lapgs_plugin.runner.running_stage import Stages
+from lapgs_plugin.runs.profiling import Breakdown
 
 
 class IterationParts:
     """Mark the parts of iterations of the running stage.
 
     Args:
-        device: device that the checkout renders on.
+        stages: hold the running stage, whose record has its breakdown.
         measures: whether to measure; without it no symbol is replaced.
-
-    Attributes:
-        device: as given.
-        breakdown: seconds of the running stage by part.
     """
 
-    def __init__(self, device: torch.device, measures: bool) -> None:
-        self.device, self._measures = device, measures
-        self.breakdown = Breakdown()
+    def __init__(self, stages: Stages, measures: bool) -> None:
+        self._stages, self._measures, self._nothing = stages, measures, Breakdown()
 
-    def stage_begins(self) -> None:
-        """Start the measurement of another stage."""
-        self.breakdown = breakdown_on(self.device) if self._measures else Breakdown()
+    @property
+    def _breakdown(self) -> Breakdown:
+        """Seconds of the running stage by part."""
+        running = self._stages.running
+        return self._nothing if running is None else running.record.breakdown
 
     def mark_render(self, part: str) -> None:
         """Mark the beginning of a part of a render with gradients: "forward", or "loss" when it has rasterized."""
         if torch.is_grad_enabled():
-            self.breakdown.mark(part)
+            self._breakdown.mark(part)
 
     def replacements(self, profile: Profile, info: BackboneInfo) -> list[Replacement]:
         """Return replacements in the training loop, whose time includes that of all others: they come last."""
@@ -70,8 +68,8 @@ class IterationParts:
         if not self._measures:
             yield
             return
-        before = register_optimizer_step_pre_hook(lambda *_: self.breakdown.mark("optimizer"))
-        after = register_optimizer_step_post_hook(lambda *_: self.breakdown.mark("other"))
+        before = register_optimizer_step_pre_hook(lambda *_: self._breakdown.mark("optimizer"))
+        after = register_optimizer_step_post_hook(lambda *_: self._breakdown.mark("other"))
         try:
             yield
         finally:
@@ -80,15 +78,15 @@ class IterationParts:
 
     def _backward(self, original: Callable[..., None]) -> Callable[..., None]:
         def backward(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> None:
-            self.breakdown.mark("backward")
+            self._breakdown.mark("backward")
             original(tensor, *args, **kwargs)
-            self.breakdown.mark("other")
+            self._breakdown.mark("other")
 
         return backward
 
     def _densifying(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def densify(*args: Any, **kwargs: Any) -> Any:
-            with self.breakdown.within("densification"):
+            with self._breakdown.within("densification"):
                 return original(*args, **kwargs)
 
         return densify

@@ -1,9 +1,4 @@
-"""Optimize the finished fields jointly with the residual in the last part of a residual stage.
-
-A frozen coarse level cannot correct errors that the finer level is unable to represent. So towards the end of a stage
-the finished fields are rendered instead of being read from a cache, and step whenever the residual does. Each adds the
-launches of a render of its own to an iteration.
-"""
+"""Render finished models and step them with the residual, in the joint part of its stage."""
 
 from __future__ import annotations
 
@@ -17,58 +12,55 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
-from lapgs_plugin.ops.composition import compose
-from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.runner.context import FinishedStage, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
+from lapgs_plugin.stages.joint import RenderedPredictions
 
 COLORS = ("f_dc", "f_rest")
 
 
-@dataclass
+@dataclass(frozen=True)
 class _JointField:
     """Hold a finished field that is optimized again.
 
     Attributes:
-        of: the stage that it comes from.
+        finished: the stage that it comes from.
         gaussians: the checkout's model of it.
         rendering: tells the rasterizer's wrapper to render it alone.
         views: level views by key, made when they are first rendered.
     """
 
-    of: FinishedStage
+    finished: FinishedStage
     gaussians: Any
     rendering: StageRendering
     views: dict[str, Any] = field(default_factory=dict)
 
 
-class JointLevels:
-    """Render the predictions of coarser levels in place of cached ones, and optimize the fields behind them.
+class JointModels:
+    """Optimize the fields of finished stages.
 
     Args:
-        run: the run, whose archive has the coarser fields.
-        finished: the coarser stages, coarsest first.
+        run: the run, whose archive has the fields.
+        finished: their stages, coarsest first.
         views: of the running stage.
     """
 
-    where = "gpu"  # nothing has to be copied
-
     def __init__(self, run: TrainingRun, finished: Sequence[FinishedStage], views: StageViews) -> None:
         self._context, self._run, self._views = run.context, run, views
-        self._pyramid = Pyramid(run.settings.grid)
-        self._fields = [self._load(one) for one in finished]
+        self._fields = {stage.stage.level: self._load(stage) for stage in finished}
 
     def _load(self, finished: FinishedStage) -> _JointField:
-        adapter, device, call = self._context.adapter, self._context.device, finished.call
-        gaussians = adapter.model_of(call, self._run.archive.field(finished.stage.level).to(device))
-        rendering = StageRendering(
-            signed=finished.stage.signed, path=self._run.color_path, views=self._views.cameras, capture=True
-        )
+        adapter, call, stage = self._context.adapter, finished.call, finished.stage
+        gaussians = adapter.model_of(call, self._run.archive.field(stage.level).to(self._run.device))
+        rendering = StageRendering(stage.signed, self._run.color_path, self._views.cameras, capture=True)
         return _JointField(finished, gaussians, rendering)
+
+    def predictions(self) -> RenderedPredictions:
+        """Return predictions by these fields, differentiable where gradients are recorded."""
+        return RenderedPredictions(tuple(self._fields), self._render, self._views.sizes, self._run.pyramid)
 
     def follow(self, gaussians: Any, residual_color_rate: float) -> None:
         """Step the finished fields whenever an optimizer of the running stage steps, at its learning rates.
@@ -81,40 +73,31 @@ class JointLevels:
             names = [group.get("name") for group in leading.param_groups]
             groups = [
                 {
-                    "params": [getattr(one.gaussians, GROUPS[name])],
+                    "params": [getattr(joint.gaussians, GROUPS[name])],
                     "leader": position,
-                    "factor": 1 / residual_color_rate if name in COLORS and not one.of.stage.signed else 1.0,
+                    "factor": 1 / residual_color_rate if name in COLORS and not joint.finished.stage.signed else 1.0,
                 }
-                for one in self._fields
+                for joint in self._fields.values()
                 for position, name in enumerate(names)
                 if name in GROUPS  # archived fields have none of a fork's other parameters
             ]
             if groups:
                 following = torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS)
-                if self._context.device.type == "cuda":
+                if self._run.device.type == "cuda":
                     fuse_steps(following)
                 leading.register_step_post_hook(partial(_follow, following))
 
-    def prefetch(self, key: str) -> None:
-        """Do nothing: predictions are rendered."""
-
-    def get(self, key: str) -> Tensor:
-        """Return the upsampled prediction (3, h, w) of a view, differentiable where gradients are recorded."""
-        renders = ((one.of.stage.level, self._render(one, key)) for one in self._fields)
-        width, height = self._views.size(key, self._fields[-1].of.stage.level - 1)
-        return upsample(self._pyramid, compose(self._pyramid, renders).image, (height, width))
-
-    def _render(self, one: _JointField, key: str) -> Tensor:
-        """Return the image (3, h, w) of one field alone."""
-        if key not in one.views:
-            stage, camera = one.of.stage, self._views.cameras[key]
-            size = self._views.size(key, stage.level)
-            one.views[key] = self._context.adapter.view_at(camera, size, stage.signed, _no_image)
-        return self._context.render(one.rendering, one.of.call, one.views[key], one.gaussians).image
+    def _render(self, level: int, keys: Sequence[str]) -> Tensor:
+        """Return the image (3, h, w) of a level's field alone; `keys` is that of one view."""
+        (key,), joint = keys, self._fields[level]
+        if key not in joint.views:
+            camera, size = self._views.cameras[key], self._views.size(key, level)
+            joint.views[key] = self._context.adapter.view_at(camera, size, joint.finished.stage.signed, _no_image)
+        return self._context.render(joint.rendering, joint.finished.call, joint.views[key], joint.gaussians).image
 
     def fields(self, read: Callable[[Any, bool], GaussianField]) -> dict[int, GaussianField]:
         """Return the fields by level; `read` makes one from the checkout's model and whether it is a residual."""
-        return {one.of.stage.level: read(one.gaussians, one.of.stage.signed) for one in self._fields}
+        return {level: read(joint.gaussians, joint.finished.stage.signed) for level, joint in self._fields.items()}
 
 
 def _follow(following: torch.optim.Optimizer, leading: torch.optim.Optimizer, *_: Any) -> None:

@@ -69,16 +69,16 @@ numbers.Real.register(LateNumber)  # loggers and progress bars ask for a number 
 
 
 def _computed(compute: Callable[[Any, Any], Any], first: Any, second: Any) -> Any:
-    """Return what is computed of two numbers, of which one is late; at once if the other is something else."""
-    pending = sum(each.pending for each in (first, second) if isinstance(each, LateNumber))
-    both = all(isinstance(each, (int, float, LateNumber)) for each in (first, second))
+    """Return a result of two numbers of which one is late: late itself, unless the other is no number."""
+    pending = sum(value.pending for value in (first, second) if isinstance(value, LateNumber))
+    both = all(isinstance(value, (int, float, LateNumber)) for value in (first, second))
     if not both or pending > MOST_PENDING:
         return compute(number(first), number(second))
     return LateNumber(lambda: compute(number(first), number(second)), pending + 1)
 
 
 def number(value: Any) -> Any:
-    """Return a late number once it is there, and everything else as it is."""
+    """Return a late number as a float, waiting for it; return any other value unchanged."""
     return float(value) if isinstance(value, LateNumber) else value
 
 
@@ -102,9 +102,9 @@ def elapsed_now(start: Any, end: Any) -> Any:
 
 def recorded(event: Any, *stream: Any, **named: Any) -> Any:
     """Return a new event like this one, recorded: the present one may be that of a late number."""
-    made = type(event)(enable_timing=True)
-    made.record(*stream, **named)
-    return made
+    copy = type(event)(enable_timing=True)
+    copy.record(*stream, **named)
+    return copy
 
 
 NAMES: dict[str, Callable[..., Any]] = {
@@ -113,7 +113,7 @@ NAMES: dict[str, Callable[..., Any]] = {
 
 
 def reading_late(training: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a script's training function, which waits for the GPU no more where it reads what it only logs."""
+    """Return a script's training function, changed so that it does not wait for numbers that it only logs."""
 
     def late(tree: ast.FunctionDef) -> LateNumbers:
         change = LateNumbers(tree, parsed(Path(inspect.getfile(training))))

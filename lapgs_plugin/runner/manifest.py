@@ -92,23 +92,23 @@ def make_manifest(
     )
 
 
-def require_same_run(found: Manifest, wanted: Manifest) -> None:
+def require_same_run(begun: Manifest, wanted: Manifest) -> None:
     """Refuse to continue a run with other settings: its levels would not belong together.
 
     Raises:
         RunFolderError: a setting differs.
     """
-    before, now = _identity(found), _identity(wanted)
+    before, now = _identity(begun), _identity(wanted)
     for name in {**before, **now}:
         if before.get(name) != now.get(name):
-            given = name in ("hierarchy", "split") and before.get(name)
-            same = f"--{name} {before[name]}" if given else "the same options"
+            named = name in ("hierarchy", "split") and before.get(name)
+            same = f"--{name} {before[name]}" if named else "the same options"
             raise RunFolderError(
                 f"this run was started with another {name} ({before.get(name)!r}, now {now.get(name)!r}); "
                 f"resume with {same}, or start again with --overwrite"
             )
     first, second = (
-        _script_options(manifest.settings.get("backbone", {}).get("arguments", ())) for manifest in (found, wanted)
+        _script_options(manifest.settings.get("backbone", {}).get("arguments", ())) for manifest in (begun, wanted)
     )
     for name in {**first, **second}:
         if first.get(name) != second.get(name):

@@ -47,17 +47,17 @@ def size_of(settings: Any) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class RasterOutputs:
-    """Hold what a rasterizer returned: an image, or an image among other outputs.
+    """Hold the outputs of a rasterizer: an image, or an image among others.
 
     Attributes:
         outputs: as the rasterizer returned them.
-        place: index or key of the image; None if the outputs are the image.
+        key: index or key of the image; None if the outputs are the image.
         channels_last: whether the stored image is (h, w, 3).
         rest: channels (k, h, w) that follow the image's in one tensor, such as normals; None without any.
     """
 
     outputs: Any
-    place: Any
+    key: Any
     channels_last: bool
     rest: Tensor | None
 
@@ -70,11 +70,11 @@ class RasterOutputs:
         Raises:
             UserInputError: there is none.
         """
-        place = _image_place(outputs, size)
-        stored = outputs if place is None else outputs[place]
+        key = _image_key(outputs, size)
+        stored = outputs if key is None else outputs[key]
         shape = stored.shape
         last = shape[-1] == 3 and (shape[-3] != 3 or shape[-3:-1] == size)
-        return cls(outputs, place, last, None if last or shape[-3] == 3 else stored[..., 3:, :, :])
+        return cls(outputs, key, last, None if last or shape[-3] == 3 else stored[..., 3:, :, :])
 
     @property
     def image(self) -> Tensor:
@@ -88,47 +88,47 @@ class RasterOutputs:
     @property
     def maps_beside(self) -> list[Tensor]:
         """Other outputs with a value of each pixel that gradients may come from, such as depths."""
-        items = () if self.place is None else _items(self.outputs)
-        others = [self.rest, *(value for place, value in items if place != self.place)]
+        items = () if self.key is None else _items(self.outputs)
+        others = [self.rest, *(value for key, value in items if key != self.key)]
         others = [value for value in others if isinstance(value, Tensor) and value.requires_grad]
         size = tuple(self.image.shape[1:])
         return [v for v in others if size in (tuple(v.shape[-2:]), tuple(v.shape[-3:-1]))]
 
     def with_image(self, image: Tensor) -> Any:
-        """Return the outputs with another image (3, h, w) in the place and shape of the first."""
+        """Return the outputs with another image (3, h, w) at the key and in the shape of the first."""
         if self.rest is not None:
             image = torch.cat([image.expand(*self.rest.shape[:-3], -1, -1, -1), self.rest], -3)
         if self.channels_last:
             image = image.permute(1, 2, 0)
         if image.shape != self._stored.shape:
             image = image.reshape(self._stored.shape)
-        return image if self.place is None else _with_item(self.outputs, self.place, image)
+        return image if self.key is None else _with_item(self.outputs, self.key, image)
 
     @property
     def _stored(self) -> Tensor:
-        stored: Tensor = self.outputs if self.place is None else self.outputs[self.place]
+        stored: Tensor = self.outputs if self.key is None else self.outputs[self.key]
         return stored
 
 
-def _image_place(outputs: Any, size: tuple[int, ...]) -> Any:
+def _image_key(outputs: Any, size: tuple[int, ...]) -> Any:
     """Return where the image is among a rasterizer's outputs, None if they are the image.
 
     Three channels come before or after the axes of pixels, more of them before.
     """
     if isinstance(outputs, Tensor):
         return None
-    found = {p: tuple(v.shape) for p, v in _items(outputs) if isinstance(v, Tensor) and v.is_floating_point()}
-    maps = {p: s for p, s in found.items() if 3 <= len(s) <= 4 and all(one == 1 for one in s[:-3])}
-    for place, shape in maps.items():
+    shapes = {p: tuple(v.shape) for p, v in _items(outputs) if isinstance(v, Tensor) and v.is_floating_point()}
+    maps = {p: s for p, s in shapes.items() if 3 <= len(s) <= 4 and all(length == 1 for length in s[:-3])}
+    for key, shape in maps.items():
         first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
         if first or last or (not size and 3 in (shape[-3], shape[-1])):
-            return place
-    for place, shape in maps.items():
+            return key
+    for key, shape in maps.items():
         if shape[-3] > 3 and shape[-2:] == size:
-            return place
-    shapes = ", ".join(map(str, found.values())) or "no tensor"
+            return key
+    returned = ", ".join(map(str, shapes.values())) or "no tensor"
     raise UserInputError(
-        f"the checkout's rasterizer returns {shapes}, expected an image (3, h, w)"
+        f"the checkout's rasterizer returns {returned}, expected an image (3, h, w)"
         f"{' of ' + 'x'.join(map(str, size[::-1])) if size else ''}; `lapgs run --off` runs the script as it is"
     )
 
@@ -137,9 +137,9 @@ def _items(outputs: Any) -> Iterable[tuple[Any, Any]]:
     return outputs.items() if isinstance(outputs, dict) else enumerate(outputs)
 
 
-def _with_item(outputs: Any, place: Any, image: Tensor) -> Any:
+def _with_item(outputs: Any, key: Any, image: Tensor) -> Any:
     """Return a tuple, list or dict of outputs with another image."""
     if isinstance(outputs, dict):
-        return {**outputs, place: image}
-    items = [image if i == place else value for i, value in enumerate(outputs)]
+        return {**outputs, key: image}
+    items = [image if i == key else value for i, value in enumerate(outputs)]
     return type(outputs)(*items) if hasattr(outputs, "_fields") else type(outputs)(items)

@@ -26,7 +26,7 @@ from lapgs_plugin.runner.manifest import make_manifest, require_same_run
 from lapgs_plugin.runner.rasterizer_choice import Decision, decided_without_trials
 from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import require_place, require_utf8
+from lapgs_plugin.runs.layout import require_place, require_room, require_utf8
 from lapgs_plugin.runs.manifest import Manifest, read_manifest
 
 logger = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
     folder, source = Path(call.dataset.model_path or unnamed), Path(call.dataset.source_path)
     absolute = folder.absolute()
     if not request.resume:
-        RunArchive.require_room(folder, request.overwrite, context.began)
+        require_room(folder, request.overwrite, context.began)
         require_place(folder, "-m")
         require_utf8(folder, "-m")
     if not source.exists():
@@ -81,7 +81,17 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test), rasterizer)
         with _open_archive(context, absolute, manifest) as archive:
             yield TrainingRun(
-                context, settings, call, scene, plan, schedule, path, archive, folder=folder, scene_files=Path(scratch)
+                settings=settings,
+                plan=plan,
+                archive=archive,
+                device=context.device,
+                context=context,
+                call=call,
+                scene=scene,
+                schedule=schedule,
+                color_path=path,
+                folder=folder,
+                scene_files=Path(scratch),
             )
 
 

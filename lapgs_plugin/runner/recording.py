@@ -26,12 +26,12 @@ from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.files import BARE_RECORD, MANIFEST, write_text
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import TimedLoop, counting_steps, timing_replacements
 from lapgs_plugin.runs.layout import exists
+from lapgs_plugin.stages.record import LoopRecord
 
 logger = logging.getLogger(__name__)
 
@@ -136,18 +136,18 @@ class BareRunRecorder(TimedLoop):
 
     def _contents(self, call: TrainingCall) -> dict[str, Any]:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
-        record, count = self.record, len(self.gaussians._xyz)
+        record, counts, count = self.record, self.record.counts, len(self.gaussians._xyz)
         return {
             "backbone": self._adapter.info.name,
             **({"compiled": self._compiled} if self._compiled else {}),
             "iterations": self.iteration,
-            "train_seconds": record.seconds,
+            "train_seconds": counts.seconds,
             "saving_seconds": record.overhead.get("saving", 0.0),
             "num_gaussians": count,
-            "peak_gaussians": max(record.peak, count),
-            "mean_gaussians": record.mean_gaussians,
+            "peak_gaussians": max(counts.peak_gaussians, count),
+            "mean_gaussians": counts.mean_gaussians,
             "memory_bytes": record.memory_bytes,
-            **({} if (busy := record.gpu_busy_seconds) is None else {"gpu_busy_seconds": busy}),
+            **({} if (busy := record.busy.seconds()) is None else {"gpu_busy_seconds": busy}),
             **self._held_out(call),
             "timeline": self._timeline,
         }

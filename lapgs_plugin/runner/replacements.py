@@ -91,31 +91,35 @@ class StageReplacements:
                 control[name] = lambda original: self._make_density_control(_without_size_limit(original))
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
-        made: dict[str, Callable[..., Any]] = {"training_setup": self._make_training_setup, **control}
+        replaced: dict[str, Callable[..., Any]] = {"training_setup": self._make_training_setup, **control}
         if (visibility := self._context.wrapper.visibility) is not None:
-            made[STATISTICS] = visibility.in_statistics
-        return [each for name, make in made.items() for each in of_class(profile.model, name, make, "training()")]
+            replaced[STATISTICS] = visibility.in_statistics
+        return [
+            replacement
+            for name, make in replaced.items()
+            for replacement in of_class(profile.model, name, make, "training()")
+        ]
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""
         hooks, names = self._context.hooks, self._context.adapter.info.density_scores
         consumer = "training() when it densifies and prunes"
-        found = profile.named(names) if hooks else []
-        return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in found]
+        scores = profile.named(names) if hooks else []
+        return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in scores]
 
     def _in_losses(self, profile: Profile) -> list[Replacement]:
         if not self._context.request.settings.fused_ssim:
             return []
-        found = [place for place in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*place))]
-        return [Replacement(*place, checkout_ssim.in_our_kernels, "training() in its loss") for place in found]
+        holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
+        return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         visibility = self._context.wrapper.visibility
-        made = original if visibility is None else visibility.in_loop(reading_late(original))
+        early = original if visibility is None else visibility.in_loop(reading_late(original))
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:
-            return self._train(TrainingCall.bind(made, args, kwargs))
+            return self._train(TrainingCall.bind(early, args, kwargs))
 
         return training
 

@@ -8,9 +8,9 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import TimedLoop
+from lapgs_plugin.stages.record import LoopRecord
 
 
 class RunningStage(TimedLoop):
@@ -28,7 +28,7 @@ class RunningStage(TimedLoop):
 
     @abstractmethod
     def entered(self) -> AbstractContextManager[None]:
-        """Prepare the stage, act on exceptions of what runs inside, and release what the stage holds."""
+        """Prepare the stage, act on exceptions raised inside, and release its images and models."""
 
     @abstractmethod
     def scene_for(self, gaussians: Any) -> Any:

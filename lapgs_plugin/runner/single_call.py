@@ -69,14 +69,16 @@ class NestedStage(ActiveStage):
         self._views.take_over(before._views)
 
     def _finish_despite(self, error: Exception) -> None:
-        """Say what may have failed if views have just changed: the checkout's own error may be about sizes."""
+        """Explain an error soon after views changed: the checkout's own message may be about sizes alone."""
         by_size = isinstance(error, RuntimeError) and not isinstance(error, torch.cuda.OutOfMemoryError)
         if by_size and self._took_over and self.iteration <= SOON:
             logger.warning(
                 "%s() failed %d iterations after its views got the size of level %d; a script that keeps images of "
                 "views, or what it made of them, from before its loop cannot train nested levels in one call: "
                 "--hierarchy laplacian makes a call for each level",
-                *(self._call.function.__name__, self.iteration, self.stage.level),
+                self._call.function.__name__,
+                self.iteration,
+                self.stage.level,
             )
         if self.stage.level == 0:
             super()._finish_despite(error)
@@ -93,7 +95,7 @@ class SingleCall:
         self._context, self._run, self._plan = run.context, run, run.plan
         finished = len(run.archive.available_levels)
         self._done, self._left = list(run.plan)[:finished], list(run.plan)[finished:]
-        # Copies: the folder and the thresholds of this run are not what the script's main block sees afterwards.
+        # Copies: the script's main block must not see the folder and the thresholds of this run.
         self._call = run.call.copied()
         self._call.dataset.model_path = str(run.archive.path("level_0"))
         self._stage: NestedStage

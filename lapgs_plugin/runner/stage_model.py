@@ -1,4 +1,4 @@
-"""Initialise the checkout's model of a stage, and collect what the next stage's model inherits."""
+"""Initialise the checkout's model of a stage, and collect the state that the next stage's model inherits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.errors import RunFolderError, UserInputError
-from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.runner.context import StageResult, TrainingRun
@@ -27,8 +26,8 @@ class StageModel:
     """Pass Gaussians and optimizer state from one stage's model to the next; `before` is None for the base."""
 
     def __init__(self, run: TrainingRun, stage: Stage, before: StageResult | None) -> None:
-        self._options, self._adapter, self._device = run.settings, run.context.adapter, run.context.device
-        self._scene, self._stage, self._before = run.scene, stage, before
+        self._options, self._adapter, self._device = run.settings, run.context.adapter, run.device
+        self._run, self._scene, self._stage, self._before = run, run.scene, stage, before
         self._kept: Tensor  # (n,) Gaussians of the level before that are inherited
 
     def initialise(self, gaussians: Any) -> None:
@@ -37,12 +36,11 @@ class StageModel:
         if self._before is None:
             gaussians.create_from_pcd(points, *others)
             return
-        generator = torch.Generator().manual_seed(self._options.seed)
         mode = self._options.inherit_mode
-        field, self._kept = inherit(self._before.field, mode, self._options.inherit_ratio, generator)
+        field, self._kept = self._run.inherited(self._before.field)
         positions = field.means.numpy().astype(np.float64)
         grey = np.full_like(positions, 0.5)  # the colour whose SH coefficient is zero
-        # What else a fork knows of each point of the scene, it does not know of these.
+        # Other values that a fork has of each point of the scene are unknown here.
         count, known = len(points.points), fields_of(points).items()
         unknown = {
             name: np.zeros((len(positions), *value.shape[1:]), value.dtype)

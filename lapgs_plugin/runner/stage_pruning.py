@@ -41,9 +41,9 @@ def require_pruning(call: TrainingCall, share: float, model: type) -> None:
             f"({error}); leave --prune out"
         ) from error
     if pruning_iteration(call) is None:
-        given = ", ".join(f"--{name} {getattr(call.opt, name, 'missing')}" for name in (*DENSIFICATION, "iterations"))
+        options = ", ".join(f"--{name} {getattr(call.opt, name, 'missing')}" for name in (*DENSIFICATION, "iterations"))
         raise UserInputError(
-            f"--prune {share}: prunes when densification ends, which it does not in this run ({given}); expected an "
+            f"--prune {share}: prunes when densification ends, which it does not in this run ({options}); expected an "
             "end between its start and the last iteration: leave --prune out, or change these options of the script"
         )
 

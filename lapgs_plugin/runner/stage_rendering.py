@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,25 +19,12 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.object_values import RasterOutputs, fields_of, matrix_keys, size_of
 from lapgs_plugin.runner.signed_calls import with_signed_colors
 from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.stages.joint import Predictions
 
 logger = logging.getLogger(__name__)
 
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
-
-
-class Predictions(Protocol):
-    """Return upsampled predictions of coarser levels by view: cached images, or renders of finished fields."""
-
-    @property
-    def where(self) -> str:
-        """Where they wait, as `ImageStore.where`."""
-
-    def prefetch(self, key: str, /) -> None:
-        """Prepare for a `get` of this view."""
-
-    def get(self, key: str, /) -> Tensor:
-        """Return the prediction (3, h, w) on the device, float32, at the size of the finer level."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +56,7 @@ class StageRendering:
         signed: whether the field is a residual.
         path: how signed colour is evaluated.
         views: the checkout's camera of each view by key.
-        images: targets I^l, what else the supervision needs, and weights of masks; None if nothing is trained.
+        images: targets I^l, other images of the supervision, and weights of masks; None if nothing is trained.
         accumulated: Up(I_hat^(l+1)) by key; None for the base.
         masked: keys of the training views whose masks the loop's losses and scores have to honour.
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
@@ -123,23 +110,24 @@ class StageRendering:
                 for whole in (camera.world_view_transform, getattr(camera, "full_proj_transform", None)):
                     for matrix in () if whole is None else matrix_keys(whole):
                         self._by_matrix.setdefault(matrix, set()).add(key)
-        values = [each for each in fields_of(settings).values() if isinstance(each, Tensor) and each.shape == (4, 4)]
-        found = [keys for value in values for matrix in matrix_keys(value) if (keys := self._by_matrix.get(matrix))]
-        return set.intersection(*found) if found else set()
+        matrices = [value for value in fields_of(settings).values() if isinstance(value, Tensor)]
+        rows = [matrix for value in matrices if value.shape == (4, 4) for matrix in matrix_keys(value)]
+        candidates = [keys for matrix in rows if (keys := self._by_matrix.get(matrix))]
+        return set.intersection(*candidates) if candidates else set()
 
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         images = self.images
         stores = () if images is None else (images.targets, images.weights)
-        for each in (*stores, self.accumulated if key in self.composed else self._below_target):
-            if each is not None:
-                each.prefetch(key)
+        for store in (*stores, self.accumulated if key in self.composed else self._below_target):
+            if store is not None:
+                store.prefetch(key)
 
     @property
     def prefetches(self) -> bool:
         """Whether images of the running stage are anywhere but on the GPU."""
         stores = () if self.images is None else self.images.stores
-        return any(each is not None and each.where != "gpu" for each in (*stores, self.accumulated))
+        return any(store is not None and store.where != "gpu" for store in (*stores, self.accumulated))
 
     def target(self, key: str) -> Tensor:
         """Return the target (3, h, w) of a view: I^l, or the target residual where residuals are supervised alone."""
@@ -147,23 +135,23 @@ class StageRendering:
         target, below = self.images.targets.get(key), None if key in self.composed else self._below_target
         return target if below is None else target - below.get(key)
 
-    def compose(self, key: str | None, image: Tensor, *, by_place: bool = False) -> Tensor:
+    def compose(self, key: str | None, image: Tensor, *, by_matrix: bool = False) -> Tensor:
         """Return the composed image (3, h, w) of a view.
 
         Args:
             key: of the view; None for other cameras.
             image: (3, h, w) as rendered.
-            by_place: whether the view was recognised by its matrix alone. If the image has another size than its level,
-                it is of a viewer's camera at the same place.
+            by_matrix: whether the view was recognised by its matrix alone. If the image has another size than its
+                level, it is of a viewer's camera at the same pose.
 
         Raises:
             UserInputError: the image has another size than its level; in the backward pass: no view was recognised.
         """
         below = None
-        if key is not None and self.accumulated is not None and (by_place or key in self.composed):
+        if key is not None and self.accumulated is not None and (by_matrix or key in self.composed):
             below = self.accumulated.get(key)
             if below.shape != image.shape:
-                if not by_place:
+                if not by_matrix:
                     raise UserInputError(
                         f"the checkout renders view {view_name(key)} at {image.shape[2]}x{image.shape[1]}, expected "
                         f"{below.shape[2]}x{below.shape[1]}, the size of its level; switch its own resolution schedule "
@@ -183,7 +171,7 @@ class StageRendering:
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
         if self.images is not None and key in self.masked and not self.capture:
-            # Whatever the loop's loss is, it compares the target with itself outside of the mask.
+            # Outside of the mask any loss then compares the target with itself.
             image = fill_outside(image, self.target(key), self.images.get_weights(key))
         return image
 
@@ -193,14 +181,14 @@ class StageRendering:
         inputs: dict[str, Any],
         settings: Any,
         noted: str | None,
-        place: str = "the checkout",
+        called_at: str = "the checkout",
     ) -> Any:
         """Return the outputs of the checkout's rasterizer for its inputs and settings, with the composed image.
 
         Args:
             rasterizer, inputs, settings: of the call.
             noted: key of the view that a renderer was called with; None if it was called with none.
-            place: file and line where the checkout renders it.
+            called_at: file and line where the checkout renders it.
 
         Raises:
             UserInputError: as `compose`; in the backward pass of a residual's maps beside the image, because they do
@@ -209,23 +197,23 @@ class StageRendering:
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
-        image = self.compose(self.key(noted, settings), outputs.image, by_place=noted is None)
+        image = self.compose(self.key(noted, settings), outputs.image, by_matrix=noted is None)
         if self.capture:
             self.captured = Captured(image, rasterizer, inputs, settings)
-        for each in outputs.maps_beside if self.signed else ():
-            each.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
+        for values in outputs.maps_beside if self.signed else ():
+            values.register_hook(partial(_refuse_other_colors, called_at))  # type: ignore[no-untyped-call]  # torch's
         return outputs.with_image(image)
 
     def render_other(
-        self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, place: str = "the checkout"
+        self, rasterizer: Callable[..., Any], inputs: dict[str, Any], settings: Any, called_at: str = "the checkout"
     ) -> Any:
-        """Return the outputs for colours that are not the model's, such as features or scores, as they are.
+        """Return the outputs for colours that are not the model's, such as features or scores, unchanged.
 
         Nothing of the photos belongs into such an image. Of a residual it is its own only, of which a warning tells.
 
         Args:
             rasterizer, inputs, settings: as of `render`.
-            place: file and line where the checkout renders them.
+            called_at: file and line where the checkout renders them.
 
         Raises:
             UserInputError: in the backward pass of a residual's: it is no image of the whole scene.
@@ -239,13 +227,13 @@ class StageRendering:
                 "%s also renders other values than colours, such as depths or opacities; in a residual they are those "
                 "of its own Gaussians, not the scene's: leave out options that use them, or train with "
                 "--hierarchy nested",
-                place,
+                called_at,
             )
-        found = RasterOutputs.of(outputs, size_of(settings))
-        image = found.image.clone()  # the hook is to see uses of this image alone
+        parts = RasterOutputs.of(outputs, size_of(settings))
+        image = parts.image.clone()  # the hook is to see uses of this image alone
         if image.requires_grad:
-            image.register_hook(partial(_refuse_other_colors, place))  # type: ignore[no-untyped-call]  # torch's
-        return found.with_image(image)
+            image.register_hook(partial(_refuse_other_colors, called_at))  # type: ignore[no-untyped-call]  # torch's
+        return parts.with_image(image)
 
     @property
     def _needs_views(self) -> bool:
@@ -259,11 +247,11 @@ class StageRendering:
         return self.accumulated if coarse is None else coarse
 
 
-def _refuse_other_colors(place: str, gradient: Tensor | None) -> None:
+def _refuse_other_colors(called_at: str, gradient: Tensor | None) -> None:
     if gradient is None or not bool(gradient.any()):  # its loss has no weight
         return
     raise UserInputError(
-        f"{place}: the loop trains on an image of other colours than the model's, such as depths or features; a "
+        f"{called_at}: the loop trains on an image of other colours than the model's, such as depths or features; a "
         "residual covers a part of the scene only, so its image of them is not the whole one: leave the option out "
         "that asks for it, or train with --hierarchy nested"
     )

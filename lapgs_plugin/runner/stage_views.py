@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,19 +14,15 @@ from lapgs_plugin.checkouts.level_views import PrefetchingViews
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage, level_size
-from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
-from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.context import TrainingRun
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
-from lapgs_plugin.runs.image_store import chosen_precision
-from lapgs_plugin.runs.layout import CACHE
-from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.stages.images import StageImages
+from lapgs_plugin.stages.joint import RenderedPredictions
 
 
 class StageViews:
-    """Hold the cameras of a stage at its level's size, their targets, and the predictions of coarser levels.
+    """Hold the cameras of a stage at its level's size, and their images.
 
     Views are named by the keys of `SceneImages`.
 
@@ -36,8 +33,9 @@ class StageViews:
 
     Attributes:
         cameras: the scene's cameras by key.
+        sizes: (width, height) of their photos by key.
         train, test: keys of the training and of the held-out views.
-        images: targets of all views; empty until `load_images`.
+        images: photos and predictions of all views; photos only after `load_images`.
         rendering: the stage as the wrapped rasterizer sees it.
     """
 
@@ -48,44 +46,38 @@ class StageViews:
         call: TrainingCall,
         predictions: UpsampledImages | None,
     ) -> None:
-        self._context, self._call, self._stage, self._predictions = run.context, call, stage, predictions
-        context, settings = run.context, run.settings
-        full, supervision = context.images, SUPERVISIONS[settings.supervision]
-        train, test = ({full.key(each): each for each in cameras} for cameras in (run.scene.train, run.scene.test))
+        self._context, self._run, self._call, self._stage = run.context, run, call, stage
+        photos = run.context.images
+        train, test = (
+            {photos.key(camera): camera for camera in cameras} for cameras in (run.scene.train, run.scene.test)
+        )
         self.cameras, self.train, self.test = {**train, **test}, list(train), list(test)
-        self._pyramid = Pyramid(settings.grid)
+        self.sizes = {key: photos[key].size for key in self.cameras}
         self._views: dict[str, Any] = {}
         self._changed: dict[str, set[str]] = {}  # attributes of each view that depend on the level
-        sizes, folder = [full[key].size for key in self.cameras], run.archive.path(CACHE)
-        self._precision = chosen_precision(settings.prediction_precision, context.device)
-        self._stores = ImageStores(sizes, context.device, full.exact, settings.images_on, folder)
-        self.images = LevelImages(
-            self._stores,
-            stage.level,
-            self._pyramid,
-            with_coarse=stage.signed and supervision.needs_coarse,
-            masked=full.masked,
-        )
+        self.images = StageImages(run, stage, self.sizes, eight_bit=photos.exact, masked=photos.masked)
+        self.images.predictions = self.images.held_out = predictions
         self.rendering = StageRendering(
             signed=stage.signed,
             path=run.color_path,
             views=self.cameras,
-            images=self.images,
+            images=self.images.photos,
             accumulated=predictions,
-            masked=frozenset(train if full.masked else ()),
-            composed=frozenset(self.cameras if supervision.composes else test),
-            on_image=context.hooks.on_image if context.hooks else None,
+            masked=frozenset(train if photos.masked else ()),
+            composed=frozenset(self.cameras if run.supervision.composes else test),
+            on_image=run.context.hooks.on_image if run.context.hooks else None,
         )
 
     def load_images(self) -> None:
         """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""
-        full, training = self._context.images, set(self.train)
+        photos, training = self._context.images, set(self.train)
         for key in self.cameras:
-            self.images.put(key, full[key].load(self._device), full.mask(key), with_coarse=key in training)
+            photo = photos[key].load(self._run.device)
+            self.images.photos.put(key, photo, photos.mask(key), with_coarse=key in training)
 
     def size(self, key: str, level: int) -> tuple[int, int]:
         """Return (width, height) of a view's image at a level."""
-        return level_size(self._context.images[key].size, level)
+        return level_size(self.sizes[key], level)
 
     def train_views(self) -> list[Any]:
         """Return the training views; each draw prefetches the next view's images if they are not on the device."""
@@ -105,23 +97,17 @@ class StageViews:
     def predict(self, gaussians: Any) -> UpsampledImages:
         """Return the composed image of every view for the next level."""
         level = self._stage.level
-        predictions = self._stores.make_upsampled(level, self._precision, f"predictions_{level}", self._pyramid)
-        for key in self.cameras:
-            width, height = self.size(key, level - 1)
-            predictions.put(key, self._composed(gaussians, key), (height, width))
+        composed = partial(self._composed, gaussians)
+        predictions = self.images.cache(level, f"predictions_{level}", self.sizes, composed)
         predictions.get(next(iter(self.cameras)))  # compiles Up now, outside the next stage's clock
         return predictions
 
     @torch.no_grad()
     def held_out_quality(self, gaussians: Any) -> dict[str, float]:
         """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
-        full, device = self._context.images, self._device
+        run, level, photos = self._run, self._stage.level, self._context.images
         return mean_quality(
-            (
-                self._full_size(gaussians, key),
-                full[key].load(device),
-                None if (mask := full.mask(key)) is None else mask.to(device),
-            )
+            run.beside_photo(level, self._composed(gaussians, key), photos[key].load(run.device), photos.mask(key))
             for key in self.test
         )
 
@@ -137,27 +123,15 @@ class StageViews:
             names = before._changed[key] | self._changed[key]
             vars(view).update({name: value for name, value in fresh.items() if name in names})
 
-    @property
-    def bytes_on_device(self) -> int:
-        """Bytes of this stage's images on the GPU."""
-        predictions = 0 if self._predictions is None else self._predictions.store.bytes_on_device
-        return self.images.bytes_on_device + predictions
-
-    def drop_predictions(self) -> None:
-        """Drop the predictions of coarser levels: from now on they are rendered."""
-        if self._predictions is not None:
-            self._predictions.close()
+    def predict_jointly(self, rendered: RenderedPredictions) -> None:
+        """Render the predictions of coarser levels from now on."""
+        self.images.predictions = self.images.held_out = self.rendering.accumulated = rendered
 
     def close(self) -> None:
         """Drop the stage's images, except the predictions for the next stage."""
         self.rendering.accumulated = None
         self.images.close()
-        self.drop_predictions()
         self._views.clear()
-
-    @property
-    def _device(self) -> torch.device:
-        return self._context.device
 
     def _view(self, key: str) -> Any:
         """Return the camera of a view at this stage's level, the same object on every call."""
@@ -177,7 +151,3 @@ class StageViews:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
         rendering = replace(self.rendering, composed=frozenset(self.cameras), capture=True)
         return self._context.render(rendering, self._call, self._view(key), gaussians).image
-
-    def _full_size(self, gaussians: Any, key: str) -> Tensor:
-        """Return a view (3, h, w) at full resolution, with finer residuals of zero."""
-        return to_full_size(self._composed(gaussians, key), self.size(key, 0), self._stage.level, self._pyramid)

@@ -13,7 +13,7 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook, 
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.profile import Profile
-from lapgs_plugin.runner.loop_record import LoopRecord
+from lapgs_plugin.stages.record import LoopRecord
 
 CLOCK = "update_learning_rate"
 """Method of the family's models that loops call at the start of each iteration."""
@@ -37,7 +37,7 @@ class TimedLoop(ABC):
     @property
     def iteration(self) -> int:
         """Running iteration, from 1; 0 before the first."""
-        return self.record.iteration
+        return self.record.counts.iteration
 
     @property
     @abstractmethod
@@ -95,7 +95,7 @@ def timing_replacements(profile: Profile, running: Callable[[], TimedLoop | None
         @wraps(original)
         def update_learning_rate(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             if (loop := running()) is not None and loop.trains(gaussians):
-                loop.iteration_begins(gaussians)  # whatever the argument: some loops do not pass the iteration
+                loop.iteration_begins(gaussians)  # the argument is ignored: some loops do not pass the iteration
             return original(gaussians, *args, **kwargs)
 
         return update_learning_rate

@@ -52,8 +52,6 @@ class RunArchive(RunFiles):
     writing; reading follows links to files.
     """
 
-    require_room = staticmethod(require_room)
-
     @classmethod
     def create(
         cls, path: Path | str, manifest: Manifest, overwrite: bool = False, since: int | None = None

@@ -75,7 +75,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
         "--packed": settings.packed,
         "--sparse-adam": settings.sparse_adam,
     }
-    if needs_gsplat := [option for option, given in asked.items() if given]:
+    if needs_gsplat := [option for option, chosen in asked.items() if chosen]:
         raise UserInputError(
             f"{', '.join(needs_gsplat)} with --rasterizer {name}: only gsplat on a CUDA device does that; leave it out"
         )
@@ -85,7 +85,7 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
 
 
 def long_on_a_cpu(size: tuple[int, int], iterations: int) -> str:
-    """Return what to try where training takes hours on a CPU, else nothing."""
+    """Return a line with faster options if training takes hours on a CPU, else an empty one."""
     width, height = size
     if iterations * width * height <= LONG_ON_A_CPU:
         return ""

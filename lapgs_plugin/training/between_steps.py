@@ -11,24 +11,19 @@ from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.monitor import Monitor, Tick
-from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.monitor import Tick
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
 """Time between two checkpoints unless a number of iterations is given."""
-LOG_TICKS = 200
-"""Approximate number of history entries and progress updates of a run."""
 
 
 @dataclass
 class BetweenSteps:
-    """Do what the last step made due; none of it counts as optimization time.
+    """Log, measure, save and stop when due; none of it counts as optimization time.
 
     Attributes:
-        prepared: the run.
-        evaluation: of the stage.
-        monitor: shows progress.
+        evaluation: of the stage; its monitor shows progress.
         watcher: looks at the fields.
         stop: of the user.
         samples: iterations of the stage after which some views are measured.
@@ -36,9 +31,7 @@ class BetweenSteps:
         last_checkpoint: when it was written, or when the stage began, by `time.monotonic`.
     """
 
-    prepared: PreparedRun
     evaluation: StageEvaluation
-    monitor: Monitor
     watcher: Watcher
     stop: StopRequest
     samples: Collection[int]
@@ -51,58 +44,58 @@ class BetweenSteps:
         Raises:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
-        evaluation, stop, test_every = self.evaluation, self.stop, self.prepared.control.test_every
-        iteration = run.progress.iteration
+        evaluation, stop, test_every = self.evaluation, self.stop, run.prepared.control.test_every
+        iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self.samples)
-        due_tick = run.passed(max(1, self.prepared.settings.iterations // LOG_TICKS))
+        due_tick = run.passed(run.record.history_every)
         if due_test or due_sample or due_tick or stop.requested:
-            run.settle()  # so that the iterations in progress do not count as the time of what follows
-        measured = evaluation.held_out(run, due_test, due_sample and test_every is None)
-        if due_sample and self.prepared.aside:
-            evaluation.note_best(run)
+            run.settle()  # so that iterations in progress do not count as overhead
+        measured = evaluation.held_out(due_test, due_sample and test_every is None)
+        if due_sample and run.prepared.aside:
+            evaluation.note_best()
         if measured or due_tick:
             self._tick(run, measured)
-        evaluation.warn_of_a_fall(run, measured)
+        evaluation.warn_of_a_fall(measured)
         if self.watcher.wants_look():
             run.settle()
-            with evaluation.overhead.timed("view"):
+            with run.record.overhead.timed("view"):
                 self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: stop.requested)
         if stop.requested or self._checkpoint_is_due(run):
             self._save_checkpoint(run)
         if stop.requested:
             raise TrainingStoppedError(
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
-                f"a checkpoint is in {self.prepared.archive.path()}, the same command with --resume continues"
+                f"a checkpoint is in {run.prepared.archive.path()}, the same command with --resume continues"
             )
 
     def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self.last_tick
-        archive, progress = self.prepared.archive, run.progress
-        self.last_tick = (progress.seconds, progress.iteration)
-        finished = sum(record.train_seconds for record in archive.manifest.records if record.level != run.stage.level)
+        counts = run.counts
+        self.last_tick = (counts.seconds, counts.iteration)
         tick = Tick(
             level=run.stage.level,
-            iteration=progress.iteration,
-            elapsed=finished + progress.seconds,
-            loss=progress.loss,
+            iteration=counts.iteration,
+            elapsed=run.record.elapsed_in_run(),
+            loss=run.loss,
             num_gaussians=run.num_optimized,
-            rate=(progress.iteration - before_iteration) / max(progress.seconds - before_seconds, 1e-9),
+            rate=(counts.iteration - before_iteration) / max(counts.seconds - before_seconds, 1e-9),
             **measured,
         )
-        archive.append_history({key: value for key, value in vars(tick).items() if value is not None})
-        self.monitor.tick(run.stage, tick)
+        figures = {name: value for name, value in vars(tick).items() if value is not None}
+        run.record.write_history(counts.iteration, figures)
+        self.evaluation.monitor.tick(run.stage, tick)
 
     def _checkpoint_is_due(self, run: StageRun) -> bool:
-        if (every := self.prepared.control.checkpoint_every) is not None:
-            return run.progress.iteration % every < run.step_views
+        if (every := run.prepared.control.checkpoint_every) is not None:
+            return run.counts.iteration % every < run.step_views
         return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
 
     def _save_checkpoint(self, run: StageRun) -> None:
-        run.require_finite(run.progress.iteration)  # Gaussians of NaN are culled: the loss does not show them
-        best, overhead = self.evaluation.best, self.evaluation.overhead
+        run.require_finite(run.counts.iteration)  # Gaussians of NaN are culled: the loss does not show them
+        best, overhead = self.evaluation.best, run.record.overhead
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}
-            self.prepared.archive.save_checkpoint(state, extends_to=self.prepared.settings.iterations)
+            run.prepared.archive.save_checkpoint(state, extends_to=run.prepared.settings.iterations)
         self.last_checkpoint = time.monotonic()

@@ -39,16 +39,14 @@ class _State(TypedDict):
     __pydantic_config__ = _STRICT  # type: ignore[misc]  # what pydantic documents
 
 
-class ProgressState(_State):
-    """State of a `stage_progress.StageProgress`; the loss is NaN before the first iteration."""
+class CountsState(_State):
+    """Values of a `stages.record.LoopCounts`."""
 
     iteration: NonNegativeInt
     seconds: Seconds
-    loss: float
     peak_gaussians: NonNegativeInt
     gaussian_steps: NonNegativeInt
-    most_views: NotRequired[PositiveInt | None]
-    start_gaussians: NotRequired[NonNegativeInt | None]
+    start_gaussians: NonNegativeInt | None
 
 
 class ModelState(_State):
@@ -79,11 +77,13 @@ class BestState(_State):
 
 
 class StageState(_State):
-    """Result of `stage.StageRun.state`, and the overhead so far."""
+    """Result of `stage.StageRun.state`, and the overhead so far; the loss is NaN before the first iteration."""
 
     level: NonNegativeInt
-    progress: ProgressState
-    breakdown: NotRequired[dict[str, Seconds]]
+    counts: CountsState
+    loss: float
+    most_views: PositiveInt | None
+    breakdown: dict[str, Seconds]
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
@@ -146,7 +146,7 @@ def check_densifier(state: Mapping[str, Any], fresh: Mapping[str, Any], count: i
 
 
 def check_transforms(state: TransformsState | None, shape: torch.Size | None, name: str, path: Path) -> None:
-    """Check the state of what is learned of the training views.
+    """Check the state of the learned transforms of the training views.
 
     Args:
         state: from a checkpoint; None without transforms.
@@ -189,11 +189,11 @@ def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
 
 def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
     """Check the parts of a state against each other and the run; raises ValueError."""
-    iteration, joint_from = state["progress"]["iteration"], settings.joint_from(stage)
+    iteration, joint_from = state["counts"]["iteration"], settings.joint_from(stage)
     if state["level"] != stage.level:
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
     if iteration > (most := stage.iterations + settings.extension_of(stage)):
-        raise ValueError(f"progress.iteration is {iteration}, expected at most {most}")
+        raise ValueError(f"counts.iteration is {iteration}, expected at most {most}")
     _check_model(state["model"], "model", stage.signed, settings.sh_degree_of(stage.level))
     joint = state.get("joint") or {}
     wanted = set(finished) - {stage.level} if joint_from is not None and iteration >= joint_from else set()
@@ -230,12 +230,12 @@ def _check_model(model: dict[str, Any], name: str, signed: bool, sh_degree: int)
             f"{name} is {'a residual' if field.signed else 'no residual'} of SH degree {field.sh_degree}, expected "
             f"{'a residual' if signed else 'none'} of degree {sh_degree}"
         )
-    for each, tensor in params.items():
-        if not _is_finite(tensor, shapes.get(each), torch.float32):
-            expected = f"finite float32 {shapes.get(each)}"
-            raise ValueError(f"{name}.params.{each} is {_described(tensor)}, expected {expected}")
+    for part, tensor in params.items():
+        if not _is_finite(tensor, shapes.get(part), torch.float32):
+            expected = f"finite float32 {shapes.get(part)}"
+            raise ValueError(f"{name}.params.{part} is {_described(tensor)}, expected {expected}")
     try:
-        _check_moments(model["moments"], {each: shapes[each] for each in params})
+        _check_moments(model["moments"], {part: shapes[part] for part in params})
     except ValueError as error:
         raise ValueError(f"{name}.moments: {error}") from error
 

@@ -1,4 +1,4 @@
-"""What density control does, and 3DGS's heuristics by gsplat."""
+"""Declare density control, and provide 3DGS's heuristics by gsplat."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ViewScores:
 
 
 class DensityControl:
-    """Edit the field of one stage between iterations. Every method but `after_step` may be left as it is.
+    """Edit the field of one stage between iterations. Only `after_step` must be overridden.
 
     Args:
         opacity_weight, scale_weight: of the mean opacity, and of the mean standard deviation in world units, in the
@@ -116,13 +116,13 @@ def control_of(strategy: Strategy, schedule: StageSchedule, extent: float) -> De
     Raises:
         UserInputError: it makes something else.
     """
-    made: object = strategy.density_control(schedule, extent)
-    if not isinstance(made, DensityControl):
+    control: object = strategy.density_control(schedule, extent)
+    if not isinstance(control, DensityControl):
         raise UserInputError(
-            f"strategy {type(strategy).__qualname__}: density_control returned a {type(made).__name__}, expected a "
+            f"strategy {type(strategy).__qualname__}: density_control returned a {type(control).__name__}, expected a "
             "DensityControl"
         )
-    return made
+    return control
 
 
 class Densifier(DensityControl):
@@ -193,7 +193,7 @@ class Densifier(DensityControl):
         }
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
-        """Add what gsplat's strategy adds between two refinements; see `DensityControl`.
+        """Add to the statistics of gsplat's strategy; see `DensityControl`.
 
         It covers all Gaussians: gsplat selects visible ones, and the processor waits for a GPU to learn their number.
         """

@@ -13,15 +13,12 @@ from torch import Tensor
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.ops.color_transform import transform_colors
-from lapgs_plugin.ops.composition import add_prediction, to_full_size
+from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.runs.neighbours import predicted_exposures
-from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatch, copied, spread_views
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.stage_images import StageImages
 
 
 @dataclass
@@ -29,99 +26,91 @@ class StageEvaluation:
     """Measure views of a stage, composed so far and upsampled to full resolution.
 
     Attributes:
-        prepared: the run.
-        images: of the stage, with the predictions of the coarser levels.
-        overhead: gets the seconds that this takes.
+        run: the stage.
         watch: compares the measurements of all stages.
-        monitor: shows what they say to the user.
+        monitor: shows warnings to the user.
         best: the stage's best state so far, see `checkpoint.BestState`; None before the first measurement.
     """
 
-    prepared: PreparedRun
-    images: StageImages
-    overhead: Overhead
+    run: StageRun
     watch: QualityWatch
     monitor: Monitor
     best: dict[str, Any] | None = None
 
-    def held_out(self, run: StageRun, every: bool, sample: bool) -> dict[str, float]:
+    def held_out(self, every: bool, sample: bool) -> dict[str, float]:
         """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
-        test = self.prepared.scene.test
+        run, test = self.run, self.run.prepared.scene.test
         some = spread_views(test, SAMPLED_VIEWS) if test and sample else []
         views = test if every else some
         if not views:  # after most steps: reading exposures would wait for the GPU
             return {}
-        with self.overhead.timed("evaluation"):
+        with run.record.overhead.timed("evaluation"):
             learned = None if run.exposures is None else run.exposures.archived()
             exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
-            found = {view.name: self._psnr(run, view, exposures.get(view.name)) for view in views}
-        measured = {"psnr": fmean(plain for plain, _ in found.values())} if every else {}
+            psnrs = {view.name: self._psnr(view, exposures.get(view.name)) for view in views}
+        measured = {"psnr": fmean(plain for plain, _ in psnrs.values())} if every else {}
         if some:
-            plain, fitted = zip(*(found[view.name] for view in some), strict=True)
+            plain, fitted = zip(*(psnrs[view.name] for view in some), strict=True)
             measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}
         return measured
 
     @torch.no_grad()
-    def _psnr(self, run: StageRun, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
+    def _psnr(self, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
         """Return the PSNR in dB of a view, and after a colour fit.
 
         Args:
-            exposure: (3, 4) colour transform from renders to the view's photo; None for renders as they are.
+            exposure: (3, 4) colour transform from renders to the view's photo; None leaves renders unchanged.
         """
-        level, device, cache = run.stage.level, self.prepared.device, self.images.test_predictions
+        run, level, below = self.run, self.run.stage.level, self.run.images.held_out
         camera = level_camera(view.camera, level)
         camera = camera if run.poses is None else run.poses.camera(view.name, camera)
-        image = self.prepared.rasterizer(run.model.field, camera, background=run.background).image
-        if (joint := run.coarser.joint) is not None:
-            image = add_prediction(image, joint.predict([view.name]))
-        elif cache is not None:
-            image = add_prediction(image, cache.get(view.name))
-        whole = to_full_size(image, view.camera.size, level, self.prepared.pyramid)
+        image = run.prepared.rasterizer(run.model.field, camera, background=run.background).image
+        image = add_prediction(image, None if below is None else below.get(view.name))
+        whole, photo, mask = run.prepared.beside_photo(level, image, view.image, view.mask)
         if exposure is not None:
-            whole = transform_colors(whole, exposure.to(device))
-        photo, mask = view.image.to(device), view.mask
-        mask = None if mask is None else mask.to(device)
+            whole = transform_colors(whole, exposure.to(whole.device))
         return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
 
-    def warn_of_a_fall(self, run: StageRun, measured: Mapping[str, float]) -> None:
+    def warn_of_a_fall(self, measured: Mapping[str, float]) -> None:
         """Tell the user if held-out views got worse while the training loss fell."""
+        run = self.run
         key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
-        found, level = measured.get(key), run.stage.level
-        if found is None or not self.watch.falls(level, found, run.progress.loss):
+        now, level = measured.get(key), run.stage.level
+        if now is None or not self.watch.falls(level, now, run.loss):
             return
         helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
-        if run.exposures is None and self.prepared.supervision.composes:
+        if run.exposures is None and run.prepared.supervision.composes:
             helps.insert(0, "--exposure on if brightness or colours of the photos change")
         self.monitor.say(
-            f"level {level}, iteration {run.progress.iteration}: held-out PSNR fell to {found:.1f} dB from "
+            f"level {level}, iteration {run.counts.iteration}: held-out PSNR fell to {now:.1f} dB from "
             f"{self.watch.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
         )
 
-    def note_best(self, run: StageRun) -> None:
+    def note_best(self) -> None:
         """Keep a copy of the state in memory if it is the best of the stage on the views that were set aside."""
-        aside, iteration = self.prepared.aside, run.progress.iteration
+        run, aside, iteration = self.run, self.run.prepared.aside, self.run.counts.iteration
         last = iteration == run.stage.iterations
-        with self.overhead.timed("evaluation"):
+        with run.record.overhead.timed("evaluation"):
             fitted = run.exposures is not None
-            found = fmean(self._psnr(run, view)[fitted] for view in aside)
-            if self.best is None or found > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
+            now = fmean(self._psnr(view)[fitted] for view in aside)
+            if self.best is None or now > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
                 state = run.state()
                 parts = {name: copied(state[name]) for name in ("model", "joint", *run.transforms)}
-                self.best = {"psnr": found, "iteration": iteration, **parts}
+                self.best = {"psnr": now, "iteration": iteration, **parts}
             if last and self.best["iteration"] < iteration:
                 self.monitor.say(
                     f"level {run.stage.level}: archives the state after iteration {self.best['iteration']} of "
-                    f"{iteration}, {self.best['psnr'] - found:.2f} dB better than the last one on "
+                    f"{iteration}, {self.best['psnr'] - now:.2f} dB better than the last one on "
                     f"{len(aside)} training views that were set aside"
                 )
 
-    def return_to_best(self, run: StageRun) -> None:
+    def return_to_best(self) -> None:
         """Give a finished stage its best state."""
-        best = self.best
+        run, best = self.run, self.best
         if best is None or best["iteration"] == run.stage.iterations:
             return
-        run.model = self.prepared.restored_model(best["model"])
-        run.coarser.joint = None
+        run.model = run.prepared.restored_model(best["model"])
+        run.joint = None
         if best["joint"] is not None:
-            run.coarser.restore(best["joint"])
+            run.train_jointly(best["joint"])
         run.restore_transforms(best)

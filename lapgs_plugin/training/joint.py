@@ -1,15 +1,10 @@
-"""Train finished fields jointly with the residual, in the last part of its stage.
-
-Their predictions are rendered in every iteration instead of being read from a cache, and the fields step with the
-residual. `runner.joint` does the same in a checkout's loop.
-"""
+"""Train finished fields jointly with the residual, in the last part of its stage."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -20,8 +15,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.ops.composition import compose
-from lapgs_plugin.ops.upsample import upsample, upsample_add
+from lapgs_plugin.stages.joint import RenderedPredictions
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses
 
@@ -35,7 +29,6 @@ class JointFields:
         cameras: of every view at full size, by name.
         rasterizer: renders them.
         background: (3,) behind the base; residuals are rendered over zero.
-        pyramid: Up between two levels.
         poses: refined poses of the training views, which learn from these renders, too; None without refinement.
     """
 
@@ -43,49 +36,32 @@ class JointFields:
     cameras: Mapping[str, Camera]
     rasterizer: Rasterizer
     background: Tensor
-    pyramid: Pyramid
     poses: ViewPoses | None
     _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
-    def predict(self, names: Sequence[str]) -> Tensor:
-        """Return Up of what the fields make of views, at the size of the level below them, with gradients.
+    def predictions(self, pyramid: Pyramid) -> RenderedPredictions:
+        """Return predictions by these fields, with gradients."""
+        sizes = {name: camera.size for name, camera in self.cameras.items()}
+        return RenderedPredictions(tuple(self.models), self._render, sizes, pyramid)
 
-        Args:
-            names: of the views; several have one size, and each field renders them in one set of launches.
-
-        Returns:
-            (3, h, w) of one view, (b, 3, h, w) of several.
-        """
-        camera = self._camera(names[0], min(self.models) - 1)
-        return upsample(self.pyramid, self._composed(names), (camera.height, camera.width))
-
-    def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return what adds `predict` of the views to an image of that shape."""
-        return partial(upsample_add, self.pyramid, self._composed(names))
-
-    def _composed(self, names: Sequence[str]) -> Tensor:
-        """Return what the fields make of a view or of several, at their own finest level."""
-
-        def render(level: int, model: TrainableField) -> Tensor:
-            cameras = [self._camera(name, level) for name in names]
-            background = self.background.new_zeros(3) if model.signed else self.background
-            if len(cameras) == 1:
-                field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
-                return self.rasterizer.render_image(field, cameras[0], background=background)
-            result = self.rasterizer.render_batch(model.field, cameras, background=background, with_geometry=False)
-            return result.image
-
-        return compose(self.pyramid, ((level, render(level, model)) for level, model in self.models.items())).image
+    def _render(self, level: int, names: Sequence[str]) -> Tensor:
+        """Return the image of a level's field for a view, or for several in one set of launches."""
+        model, cameras = self.models[level], [self._camera(name, level) for name in names]
+        background = self.background.new_zeros(3) if model.signed else self.background
+        if len(cameras) == 1:
+            field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
+            return self.rasterizer.render_image(field, cameras[0], background=background)
+        return self.rasterizer.render_batch(model.field, cameras, background=background, with_geometry=False).image
 
     def _camera(self, name: str, level: int) -> Camera:
-        """A view's camera, always the same object: a rasterizer may know it by that."""
+        """Return a view's camera, always the same object: a rasterizer may know it by that."""
         if (name, level) not in self._level_cameras:
             self._level_cameras[name, level] = level_camera(self.cameras[name], level)
         camera = self._level_cameras[name, level]
         return camera if self.poses is None else self.poses.camera(name, camera)
 
     def step(self, means_rate: float, sh_rest_factor: float = 1.0, scale: StepScale = ONE_VIEW) -> None:
-        """Make one Adam step on every field, after backward passes through results of `predict`.
+        """Make one Adam step on every field, after backward passes through its renders.
 
         Args:
             means_rate: step size of the positions for one view, in world units.

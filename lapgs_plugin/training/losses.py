@@ -15,8 +15,9 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
 from lapgs_plugin.ops.photometric_loss import photometric_loss
-from lapgs_plugin.runs.level_images import LevelImages
-from lapgs_plugin.training.coarser import CoarserLevels
+from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.stages.images import StageImages
+from lapgs_plugin.stages.joint import Predictions, RenderedPredictions
 from lapgs_plugin.training.exposure import ViewExposures
 
 LossOf = Callable[[Tensor, GaussianField], Tensor]
@@ -29,8 +30,8 @@ class ViewLosses:
 
     Attributes:
         stage: in training.
-        images: the targets.
-        coarser: predict the views.
+        images: of the stage.
+        breakdown: gets the time in which coarser levels are rendered.
         hooks: compose, and compute losses.
         rasterizer: renders more of the field for hooks that ask for it.
         exposures: colour transforms of the views; None without compensation of exposure.
@@ -38,8 +39,8 @@ class ViewLosses:
     """
 
     stage: Stage
-    images: LevelImages
-    coarser: CoarserLevels
+    images: StageImages
+    breakdown: Breakdown
     hooks: HookDispatcher
     rasterizer: Rasterizer
     exposures: ViewExposures | None
@@ -48,13 +49,25 @@ class ViewLosses:
     @cached_property
     def is_plain(self) -> bool:
         """Whether the loss needs nothing but the composed image and the target, so that both can stay as stored."""
-        return self.images.weights is None and self.hooks.is_plain(self.stage)
+        return self.images.photos.weights is None and self.hooks.is_plain(self.stage)
+
+    def below(self) -> Predictions | None:
+        """Return the predictions of the views by coarser levels, for use in an iteration; None without such levels."""
+        if isinstance(self.images.predictions, RenderedPredictions):
+            self.breakdown.mark("forward")
+        return self.images.predictions
 
     def plain(self, names: Sequence[str]) -> LossOf:
         """Return the loss of some views without hooks."""
-        target = self.images.targets.get_stored(*names)
-        compose = self.coarser.adder(names)
-        return lambda rendered, _: photometric_loss(self.exposed(names, compose(rendered)), target, self.ssim_weight)
+        target = self.images.photos.targets.get_stored(*names)
+        below = self.below()
+        add = None if below is None else below.adder(names)
+
+        def loss(rendered: Tensor, _: GaussianField) -> Tensor:
+            composed = rendered if add is None else add(rendered)
+            return photometric_loss(self.exposed(names, composed), target, self.ssim_weight)
+
+        return loss
 
     def hooked(self, contexts: Sequence[StageContext], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Return the loss of some views by all hooks.
@@ -81,15 +94,15 @@ class ViewLosses:
 
     def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
-        target, coarse_target = self.images.get(*names)
+        (target, coarse_target), below = self.images.photos.get(*names), self.below()
         context = StageContext(
             stage=self.stage,
             iteration=iterations[-1],
             view=names[-1],
             target=target,
-            accumulated=self.coarser.prediction(names),
+            accumulated=None if below is None else below.get(*names),
             coarse_target=coarse_target,
-            weight=self.images.get_weights(*names),
+            weight=self.images.photos.get_weights(*names),
         )
         if len(names) == 1 or self.hooks.takes_batches:
             return [context]

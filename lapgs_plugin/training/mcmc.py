@@ -191,14 +191,14 @@ def _share(model: TrainableField, chosen: Tensor) -> Tensor:
     opacities, log_scales = model.params["opacities"], model.params["scales"]
     copies = torch.bincount(chosen)
     rows = copies.nonzero()[:, 0]
-    each, factors = copies_of(torch.sigmoid(opacities[rows]), (copies[rows] + 1).clamp_max(MOST_COPIES))
-    opacities[rows] = torch.logit(each.clamp(LEAST_OPACITY, 1.0 - torch.finfo(each.dtype).eps))
+    shared, factors = copies_of(torch.sigmoid(opacities[rows]), (copies[rows] + 1).clamp_max(MOST_COPIES))
+    opacities[rows] = torch.logit(shared.clamp(LEAST_OPACITY, 1.0 - torch.finfo(shared.dtype).eps))
     log_scales[rows] += torch.log(factors)[:, None]
     return rows
 
 
 def copies_of(opacities: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what equal Gaussians at one place need to look like a single one: equation 9 of Kheradmand et al. 2024.
+    """Return opacities and scales of equal Gaussians that together look like one: Kheradmand et al. 2024, equation 9.
 
     Its double sum is simplified by the sum of binomial coefficients C(i - 1, k) over i, which is C(N, k + 1).
 
@@ -210,10 +210,10 @@ def copies_of(opacities: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
         (n,) opacities of each of the N Gaussians, and (n,) factors on their standard deviations.
     """
     single = opacities.double()  # the sum has alternating signs
-    each = 1.0 - (1.0 - single) ** (1.0 / counts.double())
+    shared = 1.0 - (1.0 - single) ** (1.0 / counts.double())
     order = torch.arange(1, MOST_COPIES + 1, device=opacities.device)
-    factors = single / (_coefficients(opacities.device)[counts] * each[:, None] ** order).sum(1)
-    return each.to(opacities.dtype), factors.to(opacities.dtype)
+    factors = single / (_coefficients(opacities.device)[counts] * shared[:, None] ** order).sum(1)
+    return shared.to(opacities.dtype), factors.to(opacities.dtype)
 
 
 @lru_cache(maxsize=4)

@@ -177,7 +177,7 @@ def _measured(
         image = placed.rasterizer.render_image(on_device, view.camera, background=background).cpu()
         kept.append(psnr(image, view.image))
         if (photo := photos.get(view.name)) is not None:
-            run_and_field = (to_photo(each, photo.image, photo.mask) for each in (view.image, image))
+            run_and_field = (to_photo(shown, photo.image, photo.mask) for shown in (view.image, image))
             against_photos.append(tuple(run_and_field))
     means = tuple(map(fmean, zip(*against_photos, strict=True)))
     return Merged(field, fmean(kept), len(kept), (means[0], means[1]) if means else None, colors_fitted)

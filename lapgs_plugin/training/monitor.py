@@ -99,8 +99,8 @@ class ProgressMonitor(Monitor):
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         assert self._task is not None
-        found = tick.sampled_psnr if tick.psnr is None else tick.psnr
-        self._psnr = self._psnr if found is None else found  # measured rarely: the last one stays visible
+        psnr = tick.sampled_psnr if tick.psnr is None else tick.psnr
+        self._psnr = self._psnr if psnr is None else psnr  # measured rarely: the last one stays visible
         held_out = "" if self._psnr is None else f" PSNR {self._psnr:.2f} dB"
         figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
         self._progress.update(self._task, completed=tick.iteration, figures=figures)

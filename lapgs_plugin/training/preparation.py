@@ -16,7 +16,7 @@ from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.rendering.run import load_reference, require_same_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import require_cuda
-from lapgs_plugin.runs.layout import CHECKPOINT, require_place
+from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks, share_inside
 from lapgs_plugin.scenes.options import SceneOptions
@@ -102,7 +102,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
 def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
     """Yield a new run."""
     out, settings = Path(request.out), request.settings
-    RunArchive.require_room(out, request.overwrite)
+    require_room(out, request.overwrite)
     require_place(out)
     placed = training_rasterizer(request.control.rasterizer, settings)
     _check_busy(request.control, placed, settings)

@@ -1,9 +1,8 @@
-"""Hold a run of the built-in trainer that is ready to train: what was asked for, decided and checked."""
+"""Hold a run of the built-in trainer that is ready to train: its choices are decided and checked."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,13 +11,12 @@ from torch import Tensor
 from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
-from lapgs_plugin.hierarchy.plan import Stage, StagePlan
-from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.hierarchy.supervision import SUPERVISIONS, Supervision
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.scenes.scene import Scene, View
+from lapgs_plugin.stages.run import StagedRun
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import set_aside
@@ -26,29 +24,23 @@ from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 
 
 @dataclass(frozen=True)
-class PreparedRun:
-    """Hold what all stages of a run share. `preparation.prepare` makes it from a request, `of` from a scene in memory.
+class PreparedRun(StagedRun):
+    """Hold a run that is ready to train. `preparation.prepare` makes it from a request, `of` from a scene in memory.
 
     Attributes:
+        settings: of the run; the archive's manifest has the same.
         scene: its training views are those that are trained on.
         aside: training views that were set aside to choose the best state; empty without --keep best.
-        settings: of the run.
-        plan: the stages.
-        archive: the run folder, open for writing; its manifest has the same settings.
-        rasterizer: renders every field, in world units.
-        device: of the rasterizer and of training.
+        rasterizer: renders every field on the device, in world units.
         control: how the run is executed and observed.
         resumes: whether the run continues from its checkpoint, or after its last finished level.
         first_field: the first stage starts from it; None starts from the scene's points.
     """
 
+    settings: TrainSettings
     scene: Scene
     aside: tuple[View, ...]
-    settings: TrainSettings
-    plan: StagePlan
-    archive: RunArchive
     rasterizer: Rasterizer
-    device: torch.device
     control: TrainingControl
     resumes: bool
     first_field: GaussianField | None
@@ -92,16 +84,6 @@ class PreparedRun:
             resumes=resumes,
             first_field=first_field,
         )
-
-    @cached_property
-    def pyramid(self) -> Pyramid:
-        """Up and Down between levels, on the run's grid."""
-        return Pyramid(self.settings.grid)
-
-    @property
-    def supervision(self) -> Supervision:
-        """What residuals are trained against."""
-        return SUPERVISIONS[self.settings.supervision]
 
     @property
     def background(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""Decide what happens in which iteration of a stage. Imports no torch."""
+"""Schedule the events of a stage by iteration. Imports no torch."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
 
 @dataclass(frozen=True)
 class StageSchedule:
-    """Answer what is due in an iteration of one stage. It has no state.
+    """Tell which events are due in an iteration of one stage. It has no state.
 
     Iterations count from 1 in each stage. In a stage of n of N iterations, densification ends at `until` scaled by n/N,
     and the learning rate of positions decays to its last value at n; the other constants are the settings' own.
@@ -80,17 +80,17 @@ class StageSchedule:
         cls, settings: TrainSettings, stage: Stage, before: int = 0, views: int = 1, training_views: int = 1
     ) -> StageSchedule:
         shrink = min(1.0, settings.scheduled / REFERENCE_ITERATIONS)
-        given = settings.densification
+        control = settings.densification
 
         def constant(chosen: int | None, reference: int, smallest: int) -> int:
             return chosen if chosen is not None else max(smallest, round(reference * shrink))
 
-        resets = constant(given.reset_every, 3000, 300)
+        resets = constant(control.reset_every, 3000, 300)
         keeps_opacities = before or (stage.signed and not settings.residual_resets)
-        never = given.reset_every == 0 or "reset_every" in given.options.unused
-        if never or (keeps_opacities and given.reset_every is None):
+        never = control.reset_every == 0 or "reset_every" in control.options.unused
+        if never or (keeps_opacities and control.reset_every is None):
             resets = stage.iterations + 1  # never
-        until = constant(given.until, given.options.densify_until, 1)
+        until = constant(control.until, control.options.densify_until, 1)
         of_stage = round(until * stage.iterations / settings.scheduled)
         if (share := settings.densify_share_of(stage)) is not None:
             of_stage = round(share * stage.iterations)
@@ -103,9 +103,9 @@ class StageSchedule:
         rates = settings.learning_rates
         return cls(
             iterations=stage.iterations,
-            densify_start=constant(given.start, REFERENCE_DENSIFY_FROM, 1),
+            densify_start=constant(control.start, REFERENCE_DENSIFY_FROM, 1),
             densify_until=densify_until,
-            densify_every=given.every,
+            densify_every=control.every,
             reset_every=resets,
             sh_every=constant(settings.sh_every, 1000, 1),
             sh_degree=settings.sh_degree_of(stage.level),
@@ -148,7 +148,7 @@ class StageSchedule:
             due += [self.densify_until - 1, self.densify_until]
         if self.accumulate_views > 1:
             due.append(self.accumulate_from - 1)
-        return min(each for each in (*due, *self.late_prunes) if each > done)
+        return min(end for end in (*due, *self.late_prunes) if end > done)
 
     @property
     def prunes_after(self) -> int | None:
@@ -159,13 +159,13 @@ class StageSchedule:
     def late_prunes(self) -> frozenset[int]:
         """The iterations after densification in which a strategy may prune once more: every tenth of the stage in its
         second half, moved to the end of a step where gradients of several views are gathered."""
-        found = set()
+        iterations = set()
         for tenth in range(6, 10):
             due = max(round(self.iterations * tenth / 10), self.densify_until + 1)
             if self.gathers(due):
                 due += (self.accumulate_from - 1 - due) % self.accumulate_views
-            found.add(due)
-        return frozenset(due for due in found if due < self.iterations)
+            iterations.add(due)
+        return frozenset(due for due in iterations if due < self.iterations)
 
     def sampled(self, count: int) -> frozenset[int]:
         """Return so many iterations, evenly spread and ending with the last, after which quality is measured.
@@ -173,15 +173,15 @@ class StageSchedule:
         Of a stage that is extended they are iterations of the extension, which resets no opacities. Others that follow
         a reset closely come before it instead: no field looks like itself then.
         """
-        found, before = set(), self.iterations if self.extended else 0
+        iterations, before = set(), self.iterations if self.extended else 0
         for index in range(1, count + 1):
             due = before + math.ceil((self.end - before) * index / count)
             reset, since = divmod(due, self.reset_every)
             recovers = reset and since < RECOVERY and due < self.densify_until + RECOVERY and not self.extended
             if recovers and index < count:
                 due -= since + self.views  # the step that ends with the reset is the one after it
-            found.add(max(1, due))
-        return frozenset(found)
+            iterations.add(max(1, due))
+        return frozenset(iterations)
 
     def progress_at(self, iteration: int) -> float:
         """Return the share of the schedule that is done, from 0 to 1; 1 while a finished stage is extended."""

@@ -23,7 +23,7 @@ from lapgs_plugin.training.views import LevelView, shuffled
 
 @dataclass
 class FieldScoring:
-    """Render the field once more, also without colours, to see what each Gaussian does.
+    """Render the field once more, also without colours, to score its Gaussians.
 
     Attributes:
         rasterizer: renders the field.
@@ -52,17 +52,18 @@ class FieldScoring:
             degree: of the SH that are active in it.
             threshold: as `view_scores` takes it.
         """
-        images, ssim_weight = self.losses.images, self.losses.ssim_weight
+        photos, ssim_weight = self.losses.images.photos, self.losses.ssim_weight
         chosen = shuffled(len(self.views), self.seed, self.losses.stage.level, iteration)
         plain, grey = _grey(field)
 
         def asked(view: LevelView) -> ScoredView:
             with torch.no_grad():
                 image = self._render(field, view, degree)
-                below, (target, _) = self.losses.coarser.prediction([view.name]), images.get(view.name)
+                below, (target, _) = self.losses.below(), photos.get(view.name)
+                image = image if below is None else image + below.get(view.name)
                 self.breakdown.mark("densification")
-                composed = self.losses.exposed([view.name], image if below is None else image + below)
-                whole = fill_outside(composed, target, images.get_weights(view.name))
+                composed = self.losses.exposed([view.name], image)
+                whole = fill_outside(composed, target, photos.get_weights(view.name))
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view, 0), whole, target, loss)
 

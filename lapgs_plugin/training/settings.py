@@ -74,8 +74,8 @@ class LearningRates:
 
     def check(self) -> None:
         """Raise a UserInputError about a rate that is not positive."""
-        for each in fields(self):
-            require_positive(each.name, getattr(self, each.name), "learning rate")
+        for rate in fields(self):
+            require_positive(rate.name, getattr(self, rate.name), "learning rate")
 
 
 @dataclass(frozen=True)
@@ -307,10 +307,10 @@ class TrainSettings(HierarchySettings):
     def _idle(self, strategy: Strategy) -> list[str]:
         """Return the options that were given and have no effect with a strategy."""
         return [
-            option_name(each)
+            option_name(declared)
             for owner in (self, self.densification)
-            for each in fields(owner)
-            if each.name in strategy.unused and getattr(owner, each.name) not in (each.default, 0)
+            for declared in fields(owner)
+            if declared.name in strategy.unused and getattr(owner, declared.name) not in (declared.default, 0)
         ]
 
     def for_photos(self, count: int) -> TrainSettings:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -21,26 +20,27 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.image_store import AHEAD
-from lapgs_plugin.runs.level_images import LevelImages
-from lapgs_plugin.runs.profiling import Breakdown
-from lapgs_plugin.training.coarser import CoarserLevels
+from lapgs_plugin.stages.images import StageImages
+from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.densification import DensityControl
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
+from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
-from lapgs_plugin.training.stage_progress import StageProgress
+from lapgs_plugin.training.stage_start import joint_fields
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, level_views, view_index
 
 FINITE_CHECK_EVERY = 100
 """Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
+LOSS_SMOOTHING = 0.95
+"""Weight of earlier losses in the loss that is shown and logged: single views differ too much to show a trend."""
 LOSSES_READ_EVERY = 50
 """Losses that are read together on a GPU: each reading waits until the GPU has caught up with the processor."""
 
@@ -59,7 +59,7 @@ class _Planned:
 
 @dataclass(frozen=True)
 class _Launch:
-    """Hold what is left of some views that were rendered together, after their backward pass.
+    """Hold a finished launch: views that were rendered together, after their backward pass.
 
     Attributes:
         result: of the render without its image; None if density control does not need it.
@@ -85,15 +85,16 @@ class StageRun:
     Attributes:
         prepared: the run.
         stage, schedule: of the stage.
-        images: targets of the training views.
+        images: photos of the training views, and their predictions by the coarser levels.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        coarser: predict the views; without levels for a field that is not a residual.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
-        breakdown: measures the parts of iterations.
-        busy: measures the work of the GPU.
+        record: measures it.
         say: shows a line to the user.
+        joint: the finished fields while they are trained jointly; None before.
+        loss: smoothed loss, NaN before the first iteration and after a finished stage.
+        most_views: views in one launch that fit into the GPU's memory; None as long as all have.
         step_views: number of views of the last step.
         background: (3,) behind the base; residuals are rendered over zero.
 
@@ -103,17 +104,17 @@ class StageRun:
     prepared: PreparedRun
     stage: Stage
     schedule: StageSchedule
-    images: LevelImages
+    images: StageImages
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
-    coarser: CoarserLevels
     exposures: ViewExposures | None
     poses: ViewPoses | None
-    breakdown: Breakdown
-    busy: GpuBusy
-    progress: StageProgress
+    record: StageRecord
     say: Callable[[str], None]
+    joint: JointFields | None = None
+    loss: float = math.nan
+    most_views: int | None = None
     step_views: int = 1
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
@@ -122,27 +123,28 @@ class StageRun:
     def __post_init__(self) -> None:
         prepared, stage = self.prepared, self.stage
         settings = self._settings = prepared.settings
-        self._rasterizer = prepared.rasterizer
+        self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
         self._views = level_views(prepared.scene.train, stage.level)
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
+        self._joint_from = settings.joint_from(replace(stage, iterations=self.schedule.iterations))
         self._dropout = settings.dropout_for(len(self._views))
         # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
         self._inherits_moments = stage.signed and settings.inherit_mode == "full"
         self._losses = ViewLosses(
             stage=stage,
             images=self.images,
-            coarser=self.coarser,
+            breakdown=self.record.breakdown,
             hooks=self.hooks,
             rasterizer=self._rasterizer,
             exposures=self.exposures,
             ssim_weight=settings.ssim_weight,
         )
         self._scoring = FieldScoring(
-            self._rasterizer, self._views, self._losses, self.poses, self.background, settings.seed, self.breakdown
+            self._rasterizer, self._views, self._losses, self.poses, self.background, settings.seed, self._breakdown
         )
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
-        """Train to the end of the stage, from the iteration in `progress`. An iteration is a view, a step one or more.
+        """Train to the end of the stage, from the iteration in `record`. An iteration is a view, a step one or more.
 
         Args:
             after_iteration: called after every step, outside the timed region; may raise to stop the run.
@@ -150,26 +152,24 @@ class StageRun:
         Raises:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
-        while self.progress.iteration < self.stage.iterations:
+        while self.counts.iteration < self.stage.iterations:
             self._profile()
-            start = time.perf_counter()
-            self.breakdown.mark("other")
-            iterations = self._next(self.progress.iteration)
+            self.record.resume_clock()
+            iterations = self._next(self.counts.iteration)
             self.step_views = len(iterations)
             self._step(iterations)
-            self.breakdown.pause()
-            self.progress.seconds += time.perf_counter() - start
-            self.progress.iteration += self.step_views
-            if len(self._unread) >= self._losses_at_once or self.progress.iteration == self.stage.iterations:
+            self.record.pause_clock()
+            self.counts.iteration += self.step_views
+            if len(self._unread) >= self._losses_at_once or self.counts.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
         self._profile()
 
     def _profile(self) -> None:
         """Start or end a profile if it is due, outside the timed region."""
-        if self.busy.due(self.progress.iteration):
+        if self.record.busy.due(self.counts.iteration):
             self.settle()
-            self.busy.step(self.progress.iteration)
+            self.record.profile(self.counts.iteration)
 
     def settle(self) -> None:
         """Wait for a GPU to finish its iterations, as part of the training time, and read their losses.
@@ -179,34 +179,53 @@ class StageRun:
         """
         if not self._unread:
             return
-        start = time.perf_counter()
+        self.record.resume_clock()
         waiting, self._unread = self._unread, []
         losses = torch.stack([loss for loss, _, _ in waiting]).tolist()
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        self.progress.seconds += time.perf_counter() - start
+        self.record.wait_for_device()
+        self.record.pause_clock()
         for loss, (_, iteration, views) in zip(losses, waiting, strict=True):
             self._note_loss(loss, iteration, views)
 
     def passed(self, every: int) -> bool:
         """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
-        return self.progress.iteration % every < self.step_views or self.progress.iteration == self.stage.iterations
+        return self.counts.iteration % every < self.step_views or self.counts.iteration == self.stage.iterations
 
     def reached(self, iterations: Collection[int]) -> bool:
         """Return whether the last step had one of some iterations."""
-        last = self.progress.iteration
+        last = self.counts.iteration
         return any(iteration in iterations for iteration in range(last - self.step_views + 1, last + 1))
+
+    def train_jointly(self, states: dict[int, dict[str, Any]] | None) -> None:
+        """Train the finished fields, too, from here on: from a `JointFields.state` or, given None, from the archive."""
+        self.record.note_memory(self.images.bytes_on_device)
+        self.images.drop_predictions()
+        self.joint = joint_fields(self.prepared, self.poses, states)
+        self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
+
+    def _is_joint(self, iteration: int) -> bool:
+        """Return whether the finished fields are trained jointly in an iteration."""
+        return self._joint_from is not None and iteration >= self._joint_from
+
+    @property
+    def _models(self) -> list[TrainableField]:
+        """The fields under training."""
+        return [self.model, *(() if self.joint is None else self.joint.models.values())]
 
     @property
     def num_optimized(self) -> int:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
-        return len(self.model) + sum(map(len, self.coarser.models))
+        return sum(map(len, self._models))
 
     @property
     def fields(self) -> dict[int, GaussianField]:
         """The fields under training by level, without gradients."""
-        joint = self.coarser.joint
-        return {**({} if joint is None else joint.fields), self.stage.level: self.model.field.detach()}
+        return {**({} if self.joint is None else self.joint.fields), self.stage.level: self.model.field.detach()}
+
+    @property
+    def counts(self) -> LoopCounts:
+        """Iterations, seconds and Gaussians so far."""
+        return self.record.counts
 
     @property
     def _device(self) -> torch.device:
@@ -232,18 +251,18 @@ class StageRun:
         if not self.prepared.batches or len(iterations) == 1:
             return [_Planned([iteration], [view]) for iteration, view in zip(iterations, views, strict=True)]
         alike: dict[tuple[bool, int, int, int], list[int]] = {}
-        for place, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
+        for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
             degree = self.schedule.active_sh_degree(iteration)
-            key = (self.coarser.is_joint(iteration), view.camera.width, view.camera.height, degree)
-            alike.setdefault(key, []).append(place)
+            key = (self._is_joint(iteration), view.camera.width, view.camera.height, degree)
+            alike.setdefault(key, []).append(index)
         launches = []
         for (_, width, height, _), group in alike.items():
             most = max(1, round(PIXELS_OF_A_LAUNCH / (width * height)))
-            count = math.ceil(len(group) / min(most, self.progress.most_views or most))
+            count = math.ceil(len(group) / min(most, self.most_views or most))
             size = math.ceil(len(group) / count)
             for start in range(0, len(group), size):
-                places = group[start : start + size]
-                launches.append(_Planned([iterations[i] for i in places], [views[i] for i in places]))
+                chosen = group[start : start + size]
+                launches.append(_Planned([iterations[i] for i in chosen], [views[i] for i in chosen]))
         return launches
 
     def _planned(self, iterations: range) -> list[_Planned]:
@@ -255,16 +274,16 @@ class StageRun:
     def _step(self, iterations: range) -> None:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
         launches = self._run_launches(iterations)
-        self.breakdown.mark("backward")
+        self._breakdown.mark("backward")
         self.densifier.regularize(self.model, iterations)
         last = iterations[-1]
         for launch in launches:
-            self.progress.gaussian_steps += launch.gaussians * launch.views
-        self.breakdown.mark("other")
+            self.counts.gaussian_steps += launch.gaussians * launch.views
+        self._breakdown.mark("other")
         context, self._context = self._context, None
         if context is not None:
             self.hooks.after_backward(context)
-        self.breakdown.mark("optimizer")
+        self._breakdown.mark("optimizer")
         means_rate, rest = (
             self.schedule.means_learning_rate(last) * self.prepared.scene.extent,
             self.schedule.sh_rest_factor_at(last),
@@ -272,16 +291,16 @@ class StageRun:
         scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
         active = None if self._inherits_moments else (self.schedule.active_sh_degree(last) + 1) ** 2
         self.model.step(means_rate, active, rest, scale)
-        if self.coarser.joint is not None:
-            self.coarser.joint.step(means_rate, rest, scale)
+        if self.joint is not None:
+            self.joint.step(means_rate, rest, scale)
         for learned in filter(None, self.transforms.values()):
             learned.after_step(last, len(iterations))
-        self.breakdown.mark("densification")
+        self._breakdown.mark("densification")
         for launch in launches[:-1]:
             if launch.result is not None:
                 self.densifier.accumulate(launch.result, launch.camera)
         self._densify(context, last, launches[-1])
-        self.breakdown.mark("other")
+        self._breakdown.mark("other")
         if last % FINITE_CHECK_EVERY < len(iterations) or last == self.stage.iterations:
             self.require_finite(last)
 
@@ -293,9 +312,9 @@ class StageRun:
             following = [] if is_last else self._planned(self._next(iterations[-1]))[:1]
             try:
                 thens = [*planned[1:], *following, None]
-                done = [self._launch(each, then) for each, then in zip(planned, thens, strict=False)]
+                done = [self._launch(launch, then) for launch, then in zip(planned, thens, strict=False)]
             except torch.cuda.OutOfMemoryError:
-                most = max(len(each.views) for each in planned)
+                most = max(len(launch.views) for launch in planned)
                 if most == 1:
                     raise
             else:
@@ -304,7 +323,7 @@ class StageRun:
                 return done
             # Outside of `except`, because the error keeps the tensors of the render alive.
             self._forget_gradients()
-            self.progress.most_views = most // 2
+            self.most_views = most // 2
             self._following = None
             self.say(
                 f"level {self.stage.level}: no memory for {most} views at once; from here on {most // 2} are rendered "
@@ -313,7 +332,7 @@ class StageRun:
 
     def _forget_gradients(self) -> None:
         self._context = None
-        for model in (self.model, *self.coarser.models):
+        for model in self._models:
             for param in model.params.values():
                 param.grad = None
         for learned in filter(None, self.transforms.values()):
@@ -321,24 +340,25 @@ class StageRun:
 
     @property
     def transforms(self) -> dict[str, ViewTransforms | None]:
-        """What is learned of the training views, by its name in checkpoints."""
+        """Learned transforms of the training views, by their names in checkpoints."""
         return {"exposure": self.exposures, "poses": self.poses}
 
     def _launch(self, planned: _Planned, then: _Planned | None) -> _Launch:
         """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""
         iterations, last = planned.iterations, planned.iterations[-1]
-        self.coarser.start_if_joint(last)
+        if self.joint is None and self._is_joint(last):
+            self.train_jointly(None)
         views = [at_pose(view, self.poses) for view in planned.views]
         names, cameras = [view.name for view in views], [view.camera for view in views]
         loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names, cameras)
         if then is not None:
             self._prefetch(then)
-        self.breakdown.mark("forward")
+        self._breakdown.mark("forward")
         gaussians = self.model.field
         shown = thinned(gaussians, self._dropout * self.schedule.progress_at(last))
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
-        self.breakdown.mark("loss")
+        self._breakdown.mark("loss")
         loss = loss_of(rendered, shown)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         kept = loss.detach()
@@ -346,11 +366,11 @@ class StageRun:
             result = replace(result, image=kept, transmittance=None)
         if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
             self._note_loss(kept.item(), last, len(views))
-        self.breakdown.mark("backward")
+        self._breakdown.mark("backward")
         with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
             # The gradient of the sum of the views' losses; for one view, the default of `backward`.
             loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
-        self.breakdown.mark("other")
+        self._breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
@@ -383,9 +403,10 @@ class StageRun:
     def _prefetch(self, planned: _Planned) -> None:
         """Copy the images of the next launch to the device while this one renders."""
         names = [view.name for view in planned.views[:AHEAD]]
-        self.images.prefetch(*names)
-        for name in names:
-            self.coarser.prefetch(name)
+        self.images.photos.prefetch(*names)
+        if self.images.predictions is not None:
+            for name in names:
+                self.images.predictions.prefetch(name)
 
     def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
         threshold = self.densifier.score_threshold(iteration)
@@ -400,13 +421,14 @@ class StageRun:
             changed = True
         if changed and context is not None:
             self.hooks.on_densify(context)
-        self.progress.peak_gaussians = max(self.progress.peak_gaussians, self.num_optimized)
+        self.counts.peak_gaussians = max(self.counts.peak_gaussians, self.num_optimized)
 
     def _note_loss(self, loss: float, iteration: int, views: int) -> None:
         """Add the mean loss of some views to the smoothed loss; `iteration` is that of the last view."""
         if not math.isfinite(loss):
             raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
-        self.progress.add_loss(loss, views)
+        kept = LOSS_SMOOTHING**views
+        self.loss = loss if math.isnan(self.loss) else kept * self.loss + (1 - kept) * loss
 
     def require_finite(self, iteration: int) -> None:
         """Raise a TrainingDivergedError that names an iteration if a field under training has NaN or inf."""
@@ -415,9 +437,9 @@ class StageRun:
         except FieldError as error:
             raise self._diverged(str(error), iteration) from error
 
-    def _diverged(self, what: str, iteration: int) -> TrainingDivergedError:
+    def _diverged(self, problem: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(
-            f"training diverged at level {self.stage.level}, iteration {iteration}: {what}; "
+            f"training diverged at level {self.stage.level}, iteration {iteration}: {problem}; "
             "finished levels and the last checkpoint are kept, start again with other settings"
         )
 
@@ -427,36 +449,38 @@ class StageRun:
         on_gpu = self._device.type == "cuda"
         return {
             "level": self.stage.level,
-            "progress": vars(self.progress),
-            "breakdown": self.breakdown.seconds(),
+            "counts": vars(self.counts),
+            "loss": self.loss,
+            "most_views": self.most_views,
+            "breakdown": self._breakdown.seconds(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
-            "joint": None if self.coarser.joint is None else self.coarser.joint.state(),
+            "joint": None if self.joint is None else self.joint.state(),
             **{name: None if learned is None else learned.state() for name, learned in self.transforms.items()},
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a result of `state`; model and breakdown must have been made from it already."""
-        self.progress = StageProgress(**state["progress"])
+        """Continue from a result of `state`; model and record must have been made from it already."""
+        self.loss, self.most_views = state["loss"], state["most_views"]
         self.densifier.state = {
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()
         }
         if (joint := state.get("joint")) is not None:
-            self.coarser.restore(joint)
+            self.train_jointly(joint)
         self.restore_transforms(state)
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)
 
     def restore_transforms(self, state: Mapping[str, Any]) -> None:
-        """Take what is learned of the training views from a result of `state`."""
+        """Restore the learned transforms of the training views from a result of `state`."""
         for name, learned in self.transforms.items():
-            if (found := state.get(name)) is not None:
+            if (values := state.get(name)) is not None:
                 assert learned is not None, "the trainer looks for it"
-                learned.restore(found)
+                learned.restore(values)
 
 
 @lru_cache(maxsize=64)

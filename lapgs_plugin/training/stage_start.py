@@ -1,19 +1,26 @@
-"""Make what a stage starts with: its field, the finished fields to train jointly, colours and poses of photos."""
+"""Make the things a stage starts with: field, images, finished fields to train jointly, colours and poses of photos."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.hierarchy.inheritance import field_from_points, inherit
+from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.plan import Stage, continues_field
 from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
+from lapgs_plugin.rendering.run import refined_views
+from lapgs_plugin.runs.image_store import eight_bit_levels
 from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.runs.profiling import Overhead
+from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import measure_exposure
+from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
@@ -36,9 +43,8 @@ def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
         return model
     if not stage.signed:
         return run.model(_field_of_points(run, stage) if run.first_field is None else run.first_field)
-    generator = torch.Generator().manual_seed(settings.seed)
     coarser = archive.field(stage.level + 1)
-    field, kept = inherit(coarser, settings.inherit_mode, settings.inherit_ratio, generator, settings.sh_degree)
+    field, kept = run.inherited(coarser, settings.sh_degree)
     model = run.model(field)
     if settings.inherit_mode == "full":
         model.adopt_moments(_moments(run, stage.level + 1, coarser), kept)
@@ -58,6 +64,40 @@ def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, An
     return moments
 
 
+def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
+    """Return the images of a stage with the photos of its training views, on a CPU as float32."""
+    views, on_gpu = run.scene.train, run.device.type == "cuda"
+    eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
+    masked = any(view.masked for view in views)
+    images = StageImages(run, stage, sizes_of(views), eight_bit=eight_bit, masked=masked, exact=not on_gpu)
+    for view in views:
+        images.photos.put(view.name, view.image, view.mask)
+    return images
+
+
+def predict_views(run: PreparedRun, stage: Stage, images: StageImages, overhead: Overhead) -> None:
+    """Cache predictions I_hat^(l+1) of all views, at their refined poses, for the residual stage of level l."""
+    coarser, renderer = stage.level + 1, HierarchyRenderer.from_archive(run.archive, run.rasterizer, run.device)
+
+    def cached(views: Sequence[View], name: str, where: str) -> UpsampledImages:
+        cameras = {view.name: view.camera for view in refined_views(run.archive, views)}
+        return images.cache(
+            coarser, name, sizes_of(views), lambda view: renderer.images([cameras[view]], coarser)[0], where
+        )
+
+    where = run.settings.images_on
+    with overhead.timed("cache"):
+        images.predictions = cached(run.scene.train, "train", where)
+    # Held-out views are rarely used, outside the clock: a GPU needs its memory for others.
+    with overhead.timed("evaluation"):
+        images.held_out = cached((*run.scene.test, *run.aside), "test", "memory" if where == AUTO else where)
+
+
+def sizes_of(views: Sequence[View]) -> dict[str, tuple[int, int]]:
+    """Return (width, height) of views by name."""
+    return {view.name: view.camera.size for view in views}
+
+
 def joint_fields(run: PreparedRun, poses: ViewPoses | None, states: dict[int, dict[str, Any]] | None) -> JointFields:
     """Return the finished fields for joint training, from a checkpoint's `JointFields.state` or the archive."""
 
@@ -70,7 +110,6 @@ def joint_fields(run: PreparedRun, poses: ViewPoses | None, states: dict[int, di
         cameras={view.name: view.camera for view in views},
         rasterizer=run.rasterizer,
         background=run.background,
-        pyramid=run.pyramid,
         poses=poses,
     )
 
@@ -110,12 +149,12 @@ def _measured_exposures(run: PreparedRun, monitor: Monitor) -> Tensor | None:
     if choice == OFF or not run.supervision.composes:
         return None
     measured = measure_exposure(run.scene)
-    found, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
+    spread, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
     if choice == AUTO and not differ:
         return None
     monitor.say(
-        f"exposure differs by {found}: each photo gets a colour transform; --exposure off trains without"
+        f"exposure differs by {spread}: each photo gets a colour transform; --exposure off trains without"
         if differ
-        else f"exposure differs by {found}, hardly at all; each photo gets a colour transform all the same"
+        else f"exposure differs by {spread}, hardly at all; each photo gets a colour transform all the same"
     )
     return from_gains(measured.gains) if differ else identities(len(run.scene.train))

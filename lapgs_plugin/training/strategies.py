@@ -105,7 +105,7 @@ class Strategy:
 
     @property
     def most(self) -> int | None:
-        """Most Gaussians of a stage, of what `of_stage` returned; None if there is no limit."""
+        """Limit on the Gaussians of a stage, of the result of `of_stage`; None without one."""
         return None
 
     def start(self, field: GaussianField, photos: int) -> GaussianField:
@@ -113,7 +113,7 @@ class Strategy:
         return field
 
     def density_control(self, schedule: StageSchedule, extent: float) -> DensityControl:
-        """Return the density control of one stage. Called on what `of_stage` returned.
+        """Return the density control of one stage. Called on the result of `of_stage`.
 
         Args:
             schedule: of the stage.
@@ -308,10 +308,10 @@ class Auto(Mcmc, Gradients):
         Raises:
             UserInputError: options of both were given.
         """
-        values = {each.name: (option_name(each), getattr(self, each.name)) for each in fields(self)}
-        given = {name: shown for name, (shown, value) in values.items() if value is not None and value is not False}
-        limits = [given[name] for name in ("cap_max", "base_cap_max") if name in given]
-        heuristics = [*(given[name] for name in ("grow_grad2d", "absgrad") if name in given), *heuristics]
+        values = {declared.name: (option_name(declared), getattr(self, declared.name)) for declared in fields(self)}
+        asked = {name: shown for name, (shown, value) in values.items() if value is not None and value is not False}
+        limits = [asked[name] for name in ("cap_max", "base_cap_max") if name in asked]
+        heuristics = [*(asked[name] for name in ("grow_grad2d", "absgrad") if name in asked), *heuristics]
         if limits and heuristics:
             raise UserInputError(
                 f"{limits[0]} is an option of --strategy {MCMC}, which does not take {', '.join(heuristics)}; leave "
@@ -324,7 +324,7 @@ class Auto(Mcmc, Gradients):
     def options_for(self, name: str) -> Strategy:
         """Return those options that a strategy has."""
         kind = type(STRATEGIES[name])
-        return kind(**{each.name: getattr(self, each.name) for each in fields(kind)})
+        return kind(**{declared.name: getattr(self, declared.name) for declared in fields(kind)})
 
 
 MCMC, GRADIENTS = "mcmc", "3dgs"

@@ -17,18 +17,16 @@ from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
-from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.runs.manifest import LevelRecord
-from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory, breakdown_on
-from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
+from lapgs_plugin.runs.profiling import Breakdown, Overhead, breakdown_on
 from lapgs_plugin.runs.watcher import Watcher
+from lapgs_plugin.stages.images import StageImages
+from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
-from lapgs_plugin.training.coarser import CoarserLevels
 from lapgs_plugin.training.densification import control_of
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.planning import iterations_continued, unpruned_levels
@@ -41,9 +39,13 @@ from lapgs_plugin.training.quality import (
 )
 from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.stage import StageRun
-from lapgs_plugin.training.stage_images import StageImages
-from lapgs_plugin.training.stage_progress import StageProgress
-from lapgs_plugin.training.stage_start import first_exposures, first_model, first_poses, joint_fields
+from lapgs_plugin.training.stage_start import (
+    first_exposures,
+    first_model,
+    first_poses,
+    photos_of,
+    predict_views,
+)
 from lapgs_plugin.training.strategies import Strategy
 from lapgs_plugin.training.warm_up import warm_up
 
@@ -85,7 +87,7 @@ class Trainer:
         checkpoint = self._checkpoint() if prepared.resumes else None
         if prepared.control.threads is not None:
             torch.set_num_threads(prepared.control.threads)
-        with one_pool(), stop_request() as stop:
+        with one_pool(), stop_request() as stop, prepared.image_cache():
             try:
                 warm_up(prepared)
                 self.watcher.run_started(archive)
@@ -100,7 +102,7 @@ class Trainer:
                 raise self._out_of_memory() from error
 
     def _say_what_is_chosen(self) -> None:
-        """Tell the user what the settings mean for this scene and device."""
+        """Tell the user the effect of the settings on this scene and device."""
         scene, say = self.prepared.scene, self.monitor.say
         settings = self.prepared.settings
         say(self._strategy_line())
@@ -117,8 +119,8 @@ class Trainer:
 
     def _strategy_line(self) -> str:
         """Say how Gaussians are added, and up to which numbers, coarsest level first."""
-        found = [self._strategy_of(stage).most for stage in self.prepared.plan]
-        limits = [f"{most:,}" for most in found if most is not None]
+        strategies = [self._strategy_of(stage) for stage in self.prepared.plan]
+        limits = [f"{strategy.most:,}" for strategy in strategies if strategy.most is not None]
         words = f", at most {' and '.join(limits)} Gaussians" if limits else ""
         return f"density control: --strategy {self.prepared.settings.densification.strategy}{words}"
 
@@ -145,44 +147,71 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
-        prepared = self.prepared
+        prepared, aside = self.prepared, self.prepared.aside
         before = prepared.record_to_extend(stage)
-        spent = None if before is None else before.overhead_seconds
-        overhead = Overhead(spent if checkpoint is None else checkpoint["overhead"])
-        memory = PeakMemory(prepared.device)
-        model = self._model(stage, checkpoint, overhead)
         schedule = self._schedule(stage)
-        with closing(StageImages(prepared, stage, overhead)) as images:
-            run = self._stage_run(stage, schedule, model, images, memory, checkpoint, overhead)
-            evaluation = StageEvaluation(prepared, images, overhead, self._quality, self.monitor)
+        record = self._record(replace(stage, iterations=schedule.end), before, checkpoint)
+        record.start()
+        model = self._model(stage, checkpoint, record.overhead)
+        with record.overhead.timed("pyramid"):
+            images = photos_of(prepared, stage)
+        with closing(images):
+            if stage.signed:
+                predict_views(prepared, stage, images, record.overhead)
+            run = self._stage_run(stage, schedule, model, images, record, checkpoint)
+            evaluation = StageEvaluation(run, self._quality, self.monitor)
             if checkpoint is not None:
                 evaluation.best = checkpoint.get("best")
                 self._restore(run, checkpoint)
-            if prepared.control.breakdown and not run.breakdown.measures:
+            if prepared.control.breakdown and not record.breakdown.measures:
                 self.monitor.say(f"level {stage.level} was started without --breakdown: its parts are not measured")
-            prepared.archive.rewind_history(stage.level, run.progress.iteration)
-            aside = prepared.aside
+            record.rewind_history()
             if before is not None and checkpoint is None and aside:
-                evaluation.note_best(run)  # the finished run's state is the one to beat
-            self.monitor.stage_started(run.stage, run.progress.iteration + 1)
+                evaluation.note_best()  # the finished run's state is the one to beat
+            self.monitor.stage_started(run.stage, record.counts.iteration + 1)
             if checkpoint is None:
                 self._say_if_nothing_is_visible(run)
             between_steps = BetweenSteps(
-                prepared=prepared,
                 evaluation=evaluation,
-                monitor=self.monitor,
                 watcher=self.watcher,
                 stop=stop,
                 samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
-                last_tick=(run.progress.seconds, run.progress.iteration),
+                last_tick=(record.counts.seconds, record.counts.iteration),
             )
             run.hooks.on_stage_start(run.stage)
             self.watcher.stage_started(run.stage)
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
-            evaluation.return_to_best(run)
-            self._archive_stage(run, before, overhead, memory.note(images.bytes_on_device))
+            evaluation.return_to_best()
+            record.note_memory(images.bytes_on_device)
+            self._archive_stage(run, extends=before is not None)
             self.watcher.stage_finished(run.stage, lambda: run.fields)
+
+    def _record(self, stage: Stage, before: LevelRecord | None, checkpoint: dict[str, Any] | None) -> StageRecord:
+        """Return the measurements of a stage so far: in its checkpoint, of one that is extended, or none yet.
+
+        Parts of iterations are measured from the first one on or not at all, because they add up to the whole.
+        """
+        prepared, control = self.prepared, self.prepared.control
+        counts, overhead, parts = LoopCounts(), Overhead(), dict[str, float]()
+        if before is not None:
+            counts, overhead = LoopCounts.of(before), Overhead(before.overhead_seconds)
+            parts = before.breakdown_seconds
+        if checkpoint is not None:
+            counts, overhead = LoopCounts(**checkpoint["counts"]), Overhead(checkpoint["overhead"])
+            parts = checkpoint["breakdown"]
+        measures = control.breakdown and (counts.iteration == 0 or bool(parts))
+        return StageRecord(
+            archive=prepared.archive,
+            stage=stage,
+            iterations=prepared.settings.iterations,
+            device=prepared.device,
+            profiled=stage.iterations if control.gpu_busy else 0,
+            counts=counts,
+            overhead=overhead,
+            breakdown=breakdown_on(prepared.device, parts) if measures else Breakdown(),
+            memory_before={} if before is None else before.memory_bytes,
+        )
 
     @torch.no_grad()
     def _say_if_nothing_is_visible(self, run: StageRun) -> None:
@@ -229,48 +258,26 @@ class Trainer:
         schedule: StageSchedule,
         model: TrainableField,
         images: StageImages,
-        memory: PeakMemory,
+        record: StageRecord,
         checkpoint: dict[str, Any] | None,
-        overhead: Overhead,
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
-        prepared, before = self.prepared, self.prepared.record_to_extend(stage)
-        breakdown, poses = self._breakdown(before, checkpoint), first_poses(prepared, stage)
-
-        def unfreeze(states: dict[int, dict[str, Any]] | None) -> JointFields:
-            memory.note(images.bytes_on_device)
-            images.drop_predictions()  # from now on they are rendered
-            return joint_fields(prepared, poses, states)
-
+        prepared, poses = self.prepared, first_poses(self.prepared, stage)
+        if record.counts.iteration == 0:
+            record.counts.start_gaussians = len(model)
         return StageRun(
             prepared=prepared,
             stage=replace(stage, iterations=schedule.end),
             schedule=schedule,
-            images=images.targets,
+            images=images,
             hooks=self._hooks,
             model=model,
             densifier=control_of(self._strategy_of(stage), schedule, prepared.scene.extent),
-            coarser=CoarserLevels(images.train_predictions, prepared.settings.joint_from(stage), unfreeze, breakdown),
-            exposures=first_exposures(prepared, stage, checkpoint, overhead, self.monitor),
+            exposures=first_exposures(prepared, stage, checkpoint, record.overhead, self.monitor),
             poses=poses,
-            breakdown=breakdown,
-            progress=StageProgress(start_gaussians=len(model)) if before is None else StageProgress.of(before),
-            busy=GpuBusy(stage.iterations if prepared.control.gpu_busy else 0),
+            record=record,
             say=self.monitor.say,
         )
-
-    def _breakdown(self, before: LevelRecord | None, checkpoint: dict[str, Any] | None) -> Breakdown:
-        """Return what measures the parts of iterations, from the beginning of the stage or after what was measured.
-
-        Without a measurement from the first iteration on, the parts would not add up to the whole.
-        """
-        spent = None if before is None else before.breakdown_seconds
-        if checkpoint is not None:
-            spent = checkpoint.get("breakdown")
-        continues = before is not None or checkpoint is not None
-        if not self.prepared.control.breakdown or (continues and not spent):
-            return Breakdown()
-        return breakdown_on(self.prepared.device, spent)
 
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:
         """Check a checkpoint against the stage, and continue from it."""
@@ -283,38 +290,20 @@ class Trainer:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
 
-    def _archive_stage(
-        self, run: StageRun, before: LevelRecord | None, overhead: Overhead, memory: dict[str, int]
-    ) -> None:
-        """Archive a finished stage, or the longer training of one that was finished before, with its record then."""
+    def _archive_stage(self, run: StageRun, extends: bool) -> None:
+        """Archive a finished stage, or the longer training of one that was finished before."""
         stage, field = run.stage, run.model.field.detach()
         settings, archive = self.prepared.settings, self.prepared.archive
-        used = {} if before is None else before.memory_bytes
-        record = LevelRecord(
-            level=stage.level,
-            signed=stage.signed,
-            iterations=stage.iterations,
-            num_gaussians=len(field),
-            peak_gaussians=run.progress.peak_gaussians,
-            train_seconds=run.progress.seconds,
-            overhead_seconds=dict(overhead),
-            image_size=stage.image_size,
-            memory_bytes={name: max(n, used.get(name, 0)) for name, n in memory.items()},
-            mean_gaussians=run.progress.gaussian_steps / run.progress.iteration,
-            breakdown_seconds=run.breakdown.seconds(),
-            gpu_busy_seconds=run.busy.seconds(),
-            start_gaussians=run.progress.start_gaussians,
-        )
-        joint = run.coarser.joint
+        record, joint = run.record.of_level(len(field)), run.joint
         along = {} if joint is None else joint.fields
         exposure = None if run.exposures is None else run.exposures.archived()
         poses = None if run.poses is None else run.poses.archived()
-        if before is None:
+        if extends:
+            extended = {"iterations": settings.iterations, "extended": settings.extended}
+            archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, extended)
+        else:
             inherited = stage.level > 0 and settings.inherit_mode == "full"
             moments = run.model.optimizer_moments() if inherited else None
             archive.finish_level(record, field, moments, along or None, exposure, poses)
-        else:
-            extended = {"iterations": settings.iterations, "extended": settings.extended}
-            archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, extended)
-        for line in weak_levels([record], last_psnr(archive.history()) if stage.level == 0 else {}):
+        for line in run.record.weak_lines():
             self.monitor.say(line)

@@ -47,7 +47,7 @@ class ViewTransforms(ABC):
 
     @abstractmethod
     def _recentre(self) -> None:
-        """Remove in place what all transforms have in common, which the field can express."""
+        """Remove in place the common part of all transforms, which the field can express."""
 
     def after_step(self, iteration: int, views: int) -> None:
         """Step after the views of an iteration if they end a pass through all views.

@@ -43,7 +43,7 @@ def view_index(iteration: int, count: int, seed: int, level: int) -> int:
 @lru_cache(maxsize=4)
 def shuffled(count: int, seed: int, level: int, number: int) -> list[int]:
     """Return `count` views of a level in the random order of that number."""
-    place = (seed * 1_000_003 + level) * 1_000_003 + number
-    generator = torch.Generator().manual_seed(place % 2**63)  # the generator takes no larger seed
+    draw = (seed * 1_000_003 + level) * 1_000_003 + number
+    generator = torch.Generator().manual_seed(draw % 2**63)  # the generator takes no larger seed
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order

@@ -35,7 +35,7 @@ def warm_up(run: PreparedRun) -> None:
     if joint:
         below = torch.zeros(8, 8, 3, device=device, requires_grad=True).permute(2, 0, 1)  # interleaved as renders are
         rendered.append(upsample_add(Pyramid(), below, rendered[1]))
-    targets = [torch.zeros(3, 16, 16, dtype=each, device=device) for each in target_types]
+    targets = [torch.zeros(3, 16, 16, dtype=dtype, device=device) for dtype in target_types]
     losses = [photometric_loss(image, target) for image in rendered for target in targets]
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)

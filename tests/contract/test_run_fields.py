@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.runner.context import StageResult
+from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_model import StageModel
 from tests.contract.stub_runs import NAMES, STUBS, drive_residuals, loaded, run_hierarchy
@@ -163,12 +164,13 @@ class Points(NamedTuple):
 def test_points_of_a_residual_have_what_a_fork_has_of_points() -> None:
     given: list[Points] = []
     points = Points(np.ones((7, 3)), np.ones((7, 3)), None, np.ones((7, 2), np.float32), "viridis")
-    settings, context = RunSettings(inherit="xyz"), SimpleNamespace(adapter=None, device=None)
+    context = SimpleNamespace(adapter=None)
     model = SimpleNamespace(create_from_pcd=lambda cloud, *others: given.append(cloud))
     field = some_field(5)
     stage, before = Stage(0, (8, 6), 20, signed=True), StageResult(field, None, {}, {})
     scene = SimpleNamespace(points=points, others=(1.0,))
-    run: Any = SimpleNamespace(context=context, settings=settings, scene=scene)
+    others: Any = dict.fromkeys(field.name for field in fields(TrainingRun))
+    run = TrainingRun(**{**others, "settings": RunSettings(inherit="xyz"), "context": context, "scene": scene})
     StageModel(run, stage, before).initialise(model)
     (cloud,) = given
     np.testing.assert_array_equal(cloud.points, field.means.double().numpy())

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import view_name
-from lapgs_plugin.errors import TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import TrainingDivergedError
 from lapgs_plugin.hierarchy import settings
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pyramid import Pyramid
@@ -22,7 +22,7 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runner import joint
 from lapgs_plugin.runner.context import CheckoutContext, RunRequest
-from lapgs_plugin.runner.joint import JointLevels
+from lapgs_plugin.runner.joint import JointModels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
@@ -144,46 +144,41 @@ def test_the_default_share_follows_from_the_photos_size(
 
 
 class Inspected:
-    """Inspect joint levels when they begin to follow a stage, in place of `JointLevels.follow`."""
+    """Inspect joint models when they begin to follow a stage, in place of `JointModels.follow`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, inspect: Any) -> None:
         self.results: list[Any] = []
-        original = JointLevels.follow
+        original = JointModels.follow
 
-        def follow(levels: JointLevels, gaussians: Any, residual_color_rate: float) -> None:
-            original(levels, gaussians, residual_color_rate)
-            self.results.append(inspect(levels))
+        def follow(models: JointModels, gaussians: Any, residual_color_rate: float) -> None:
+            original(models, gaussians, residual_color_rate)
+            self.results.append(inspect(models))
 
-        monkeypatch.setattr(JointLevels, "follow", follow)
+        monkeypatch.setattr(JointModels, "follow", follow)
 
 
 def test_predictions_are_up_of_the_archived_levels(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Predictions before the first joint step are those of the archived fields, rendered without the checkout's code.
+    """Predictions before the first joint step are those of the archived fields, rendered by our own rasterizer."""
 
-    The cached predictions are dropped by then.
-    """
-
-    def differences(levels: JointLevels) -> list[float]:
-        kept = levels._views._predictions
-        assert kept is not None
-        assert len(kept.store) == 0
+    def differences(models: JointModels) -> list[float]:
+        predictions = models.predictions()
         renderer = run_renderer(RunArchive.open(tmp_path / "run"), device="cpu", rasterizer="cpu")
-        found = []
+        quantiles = []
         for view in load_scene(big, progress=False).train[:3]:
-            (key,) = [key for key in levels._views.cameras if Path(view_name(key)).stem == Path(view.name).stem]
-            image = levels.get(key)
+            (key,) = [key for key in predictions.sizes if Path(view_name(key)).stem == Path(view.name).stem]
+            image = predictions.get(key)
             level = min(renderer.fields)
             composed = renderer.render(view.camera, level).composed[level]
             difference = (image - Pyramid("camera").up(composed, image.shape[1:])).detach().abs()
             # On another processor a pixel of a coarse level may differ, which Up spreads over some of 16.
-            found.append(float(difference.flatten().quantile(0.98)))
+            quantiles.append(float(difference.flatten().quantile(0.98)))
             assert difference.max() < 0.02
-        return found
+        return quantiles
 
     inspected = Inspected(monkeypatch, differences)
     run_residuals(STUBS["graphdeco"], big, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
-    assert [len(found) for found in inspected.results] == [3, 3], "two residual stages"
-    assert max(max(found) for found in inspected.results) < 5e-6  # 1.8e-7 seen
+    assert [len(quantiles) for quantiles in inspected.results] == [3, 3], "two residual stages"
+    assert max(max(quantiles) for quantiles in inspected.results) < 5e-6  # 1.8e-7 seen
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -192,20 +187,20 @@ def test_gradients_reach_every_finished_field(
 ) -> None:
     """Gradients by colour of a weighted sum of the composed image, linear in colours, equal differences."""
 
-    def relative_errors(levels: JointLevels) -> list[float]:
-        generator = torch.Generator().manual_seed(0)
-        key = next(iter(levels._views.cameras))
-        weights = torch.randn(levels.get(key).shape, generator=generator)
+    def relative_errors(models: JointModels) -> list[float]:
+        generator, predictions = torch.Generator().manual_seed(0), models.predictions()
+        key = next(iter(predictions.sizes))
+        weights = torch.randn(predictions.get(key).shape, generator=generator)
         errors = []
-        for one in levels._fields:
-            colors = one.gaussians._features_dc
+        for gaussians in models.fields(lambda gaussians, _: gaussians).values():
+            colors = gaussians._features_dc
             direction = torch.randn(colors.shape, generator=generator)
-            (gradient,) = torch.autograd.grad((weights * levels.get(key)).sum(), colors)
+            (gradient,) = torch.autograd.grad((weights * predictions.get(key)).sum(), colors)
             with torch.no_grad():
                 colors += 0.05 * direction
-                above = (weights * levels.get(key)).sum()
+                above = (weights * predictions.get(key)).sum()
                 colors -= 0.1 * direction
-                below = (weights * levels.get(key)).sum()
+                below = (weights * predictions.get(key)).sum()
                 colors += 0.05 * direction
             measured = float((above - below) / 0.1)
             errors.append(abs(float((gradient * direction).sum()) / measured - 1))
@@ -231,9 +226,9 @@ def test_fields_follow_at_their_own_rates(scene: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(joint, "_follow", follow)
     run_residuals(STUBS["graphdeco"], scene, tmp_path / "run", joint=0.25, residual_color_rate=4.0)
     assert len(rates) == 14, "a quarter of the stage's 60 iterations; after its last the checkout does not step"
-    for found in rates:
-        assert found.pop("xyz") > 0
-        assert found == pytest.approx(
+    for rate in rates:
+        assert rate.pop("xyz") > 0
+        assert rate == pytest.approx(
             {"f_dc": 0.0025, "f_rest": 0.0025 / 20, "opacity": 0.025, "scaling": 0.005, "rotation": 0.001}
         )
 
@@ -342,22 +337,15 @@ def test_a_run_killed_while_it_archives_them_ends_as_others(
 def test_nan_in_one_of_them_leaves_all_as_they_were(big: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = two_finished(big, tmp_path / "run")
     before = plys(RunArchive.open(folder))
-    original = JointLevels.fields
+    original = JointModels.fields
 
-    def poisoned(levels: JointLevels, read: Any) -> Any:
-        fields = original(levels, read)
+    def poisoned(models: JointModels, read: Any) -> Any:
+        fields = original(models, read)
         fields[1].means[0, 0] = torch.nan
         return fields
 
-    monkeypatch.setattr(JointLevels, "fields", poisoned)
+    monkeypatch.setattr(JointModels, "fields", poisoned)
     with captured(folder, []), pytest.raises(TrainingDivergedError, match="x is NaN or inf for 1 of") as caught:
         three_levels(big, folder)
     assert " of level 1, trained jointly; " in str(caught.value)
     assert plys(RunArchive.open(folder)) == before
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
-def test_a_share_is_one(share: float, scene: Path, tmp_path: Path) -> None:
-    with loaded(STUBS["graphdeco"], scene, tmp_path / "run") as adapter, pytest.raises(UserInputError) as error:
-        drive_residuals(adapter, joint=share)
-    assert str(error.value) == f"--joint {share}: expected a share of each residual stage from 0 to 1, such as 0.25"

@@ -367,7 +367,7 @@ def test_divergence_names_the_iteration_and_keeps_finished_levels(scene: Scene, 
     assert archive.available_levels == (1,)
     checkpoint = archive.load_checkpoint()
     assert checkpoint is not None
-    assert checkpoint["progress"]["iteration"] == 20
+    assert checkpoint["counts"]["iteration"] == 20
 
 
 def test_a_hook_by_entry_point_is_one_object_in_all_levels(
@@ -422,7 +422,7 @@ def test_a_checkpoint_is_kept_that_has_no_nan_although_the_loss_shows_none(scene
         train(tmp_path / "run", scene, SETTINGS, user_hooks=[Steep()], checkpoint_every=3)
     checkpoint = RunArchive.open(tmp_path / "run").load_checkpoint()
     assert checkpoint is not None
-    assert checkpoint["progress"]["iteration"] == 6
+    assert checkpoint["counts"]["iteration"] == 6
 
 
 def test_divergence_of_a_field_that_is_trained_jointly_is_named(

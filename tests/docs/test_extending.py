@@ -248,7 +248,6 @@ def test_the_operation_is_pytorchs_on_a_cpu(tone: Any) -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_operation_is_one_kernel_on_a_gpu(tone: Any) -> None:
     image = torch.rand(3, 50, 70, device="cuda")
     assert tone.triton_works(image)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 
 import pytest
-import torch
 
 from tests.unit.test_blend_kernels import run_checks
 
@@ -231,6 +230,5 @@ def test_all_interpreted() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_compiled() -> None:
     run_checks("cuda", f"NAMES, EXTRAS = {VARIANTS_OF_CLASSES}, True\n{CHECKS}{DEVICE_CHECKS}")

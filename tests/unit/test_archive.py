@@ -21,6 +21,7 @@ from lapgs_plugin.errors import FieldError, RunFolderError, UserInputError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import require_room
 from lapgs_plugin.runs.manifest import FORMAT_VERSION, LevelRecord, Manifest, SceneReference
 from tests.folders import snapshot
 from tests.mishaps import FailingWrites, Killed, disk_full
@@ -157,7 +158,7 @@ def test_a_run_that_failed_before_its_first_iteration_does_not_block_its_folder(
     if has == "damaged manifest":
         (tmp_path / MANIFEST).write_text('{"created_by": "lapgs_plugin", "records": [')
     before = snapshot(tmp_path)
-    for refuses in (RunArchive.require_room, lambda path: RunArchive.create(path, manifest())):
+    for refuses in (require_room, lambda path: RunArchive.create(path, manifest())):
         with pytest.raises(
             RunFolderError, match=r"already holds a run.*--resume.*--overwrite|is not empty and not a run"
         ):
@@ -190,7 +191,7 @@ def test_overwrite_removes_only_files_of_a_run(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, name: str, overwrite: bool) -> None:
     (tmp_path / name).write_text('{"name": "somebody else\'s web app"}')
     before = snapshot(tmp_path)
-    for refuses in (RunArchive.require_room, lambda path, overwrite: RunArchive.create(path, manifest(), overwrite)):
+    for refuses in (require_room, lambda path, overwrite: RunArchive.create(path, manifest(), overwrite)):
         with pytest.raises(RunFolderError, match=f"not empty and not a run .it holds {name}"):
             refuses(tmp_path, overwrite)
     assert snapshot(tmp_path) == before

@@ -152,7 +152,6 @@ def test_an_unknown_part_is_our_own_mistake() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_gpu_is_timed_without_waiting_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def spin(milliseconds: float) -> None:
         torch.cuda._sleep(round(milliseconds * cycles))

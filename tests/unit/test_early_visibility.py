@@ -79,7 +79,6 @@ def test_indices_are_the_same(renderers: ModuleType, device: str, counts: bool) 
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_image_is_not_waited_for(renderers: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(early_visibility, "COMPARED", 0)
     visibility = EarlyVisibility()

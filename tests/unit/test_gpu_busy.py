@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -12,8 +11,6 @@ from torch.autograd import DeviceType
 from torch.autograd.profiler_util import Interval
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner.iteration_parts import IterationParts
-from lapgs_plugin.runner.loop_record import StageRecord
 from lapgs_plugin.runs.gpu_busy import GpuBusy, kernel_seconds, profile_kernels, require_cuda
 
 
@@ -101,20 +98,3 @@ def test_on_a_gpu() -> None:
     stop = profile_kernels()
     torch.ones(1000, 1000, device="cuda").sum().item()
     assert 0 < stop() < 0.1
-
-
-def test_a_profile_that_ends_with_the_stage_leaves_no_part_running(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lapgs_plugin.runs.gpu_busy.profile_kernels", lambda: lambda: 0.5)
-    parts = IterationParts(torch.device("cpu"), measures=True)
-    window: Any = SimpleNamespace(stage=SimpleNamespace(iterations=5, level=0))
-    archive: Any = SimpleNamespace(rewind_history=lambda level, iteration: None)
-    record = StageRecord(archive, window, parts, gpu_busy=True)
-    record.start()
-    record.start_clock()
-    for iteration in range(1, 6):
-        record.count(iteration, 10)
-    record.stop(0)
-    before = parts.breakdown.seconds()
-    parts.breakdown.pause()  # as what follows training does
-    assert parts.breakdown.seconds() == before
-    assert record.gpu_busy_seconds == pytest.approx(2.5)

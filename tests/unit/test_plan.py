@@ -138,6 +138,12 @@ def test_parse_split() -> None:
             parse_split(text)
 
 
+@pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
+def test_a_share_of_joint_training_is_from_0_to_1(share: float) -> None:
+    with pytest.raises(UserInputError, match=f"--joint {share}: expected a share of each residual stage from 0 to 1"):
+        HierarchySettings(joint=share)
+
+
 def test_importing_the_package_and_the_plan_pulls_in_no_torch() -> None:
     code = "import sys, lapgs_plugin, lapgs_plugin.hierarchy.plan, lapgs_plugin.cli; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

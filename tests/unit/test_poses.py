@@ -106,7 +106,6 @@ def test_gradient_by_a_pose_through_gsplat_is_that_of_the_oracle(direct: bool) -
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("options", [{}, {"direct": False}, {"packed": True}], ids=str)
 def test_gradient_by_a_pose_on_a_gpu_is_that_of_the_oracle(options: dict[str, bool]) -> None:
     expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))

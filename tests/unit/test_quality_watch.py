@@ -26,7 +26,6 @@ from lapgs_plugin.training.quality import (
 )
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
-from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.strategies import Gradients
 from tests.training_runs import Said, StopAt, resume, train
 from tests.training_scene import ring_scene
@@ -138,14 +137,15 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
 
-    def invented(_: StageEvaluation, run: StageRun, view: View) -> tuple[float, float]:
+    def invented(evaluation: StageEvaluation, view: View) -> tuple[float, float]:
+        run = evaluation.run
         assert view.name in aside
         assert run.exposures is not None
-        place = run.stage.level, run.progress.iteration
-        fields[place] = run.model.field.means.detach().clone()
-        if run.coarser.joint is not None:
-            along[place] = run.coarser.joint.fields[1].means.clone()
-        return 0.0, 20.0 + (place in {(1, 16), (0, 36)})
+        moment = run.stage.level, run.counts.iteration
+        fields[moment] = run.model.field.means.detach().clone()
+        if run.joint is not None:
+            along[moment] = run.joint.fields[1].means.clone()
+        return 0.0, 20.0 + (moment in {(1, 16), (0, 36)})
 
     monkeypatch.setattr(StageEvaluation, "_psnr", invented)
     names, monitor = Names(), Said()

@@ -11,9 +11,9 @@ import torch
 
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.rasterizers.signed_color import ColorPath
-from lapgs_plugin.runner.loop_record import LoopRecord
 from lapgs_plugin.runner.running_stage import RunningStage, Stages
 from lapgs_plugin.runner.stage_rendering import StageRendering
+from lapgs_plugin.stages.record import LoopRecord
 
 
 def rendering() -> StageRendering:

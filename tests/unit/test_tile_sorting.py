@@ -94,7 +94,6 @@ def test_interpreted() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_compiled() -> None:
     run_checks("cuda", f"EXAMPLES = 200\n{CHECKS}")
 

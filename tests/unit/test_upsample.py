@@ -135,7 +135,6 @@ def test_a_kernel_is_checked_whatever_the_caller_is_doing(
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("shape", [(3, 7, 8), (3, 533, 800), (4, 3, 33, 150), (3, 2312, 3093)])
 def test_on_a_gpu_it_is_up_and_the_sum(shape: tuple[int, ...]) -> None:
     assert triton_works()
