@@ -87,8 +87,8 @@ class _Call:
         self.degree, self.signed, self.columns = degree & ~SIGNED_COLOR_BIT, degree < 0, inputs.means2d.shape[1]
         like = inputs.means
         view, full, centre, background = (
-            given.detach().to(like)
-            for given in (settings.viewmatrix, settings.projmatrix, settings.campos, settings.bg)
+            tensor.detach().to(like)
+            for tensor in (settings.viewmatrix, settings.projmatrix, settings.campos, settings.bg)
         )
         self.background = background.contiguous()
         self._matrices = view, full, centre
@@ -102,16 +102,16 @@ class _Call:
         return camera_of(*self._matrices, self._tangents, self.size)
 
 
-def _parameters(given: Inputs) -> tuple[Parameters, Tensor | None]:
+def _parameters(inputs: Inputs) -> tuple[Parameters, Tensor | None]:
     """Return tensors as the kernels take them, and the first coefficients that are apart."""
-    scales = given.covariances if given.scales is None else given.scales
-    colors = given.colors if given.sh is None else given.sh
+    scales = inputs.covariances if inputs.scales is None else inputs.scales
+    colors = inputs.colors if inputs.sh is None else inputs.sh
     assert scales is not None
     assert colors is not None
-    means = aligned(given.means.detach())
-    quats = means if given.quats is None else aligned(given.quats.detach())  # any tensor that is not read
-    parts = means, quats, aligned(scales.detach()), aligned(given.opacities.detach()), aligned(colors.detach())
-    return Parameters(*parts), None if given.dc is None else aligned(given.dc.detach())
+    means = aligned(inputs.means.detach())
+    quats = means if inputs.quats is None else aligned(inputs.quats.detach())  # any tensor that is not read
+    parts = means, quats, aligned(scales.detach()), aligned(inputs.opacities.detach()), aligned(colors.detach())
+    return Parameters(*parts), None if inputs.dc is None else aligned(inputs.dc.detach())
 
 
 class _Rasterize(torch.autograd.Function):
@@ -121,18 +121,18 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         from lapgs_plugin.gpu_raster.kernels import project
 
-        given = Inputs._make(tensors)
+        inputs = Inputs._make(tensors)
         width, height = call.size
         ctx.call = call
         ctx.set_materialize_grads(False)
         if call.is_empty:  # as in the CUDA code, the image is black
             ctx.save_for_backward(*tensors)
-            image = given.means.new_zeros(3, height, width)
-            radii, depths = given.means.new_zeros(0, dtype=torch.int32), given.means.new_zeros(0)
-            centres = given.means.new_zeros(0, 2)
+            image = inputs.means.new_zeros(3, height, width)
+            radii, depths = inputs.means.new_zeros(0, dtype=torch.int32), inputs.means.new_zeros(0)
+            centres = inputs.means.new_zeros(0, 2)
             ctx.mark_non_differentiable(radii, centres, depths)
             return image, image[:1].clone(), radii, centres, depths
-        parameters, first = _parameters(given)
+        parameters, first = _parameters(inputs)
         seen = project(parameters, call.camera, call.degree, call.signed, True, call.rules, call.numbers, first)
         tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
             seen, call.background, call.size, call.rules, call.numbers.mult
@@ -192,16 +192,16 @@ def _contributions(call: _Call, options: Options) -> Contributions:
 
     seen, like = call.blended, call.background
     if seen is None:
-        found = like.new_zeros(0, len(SUMS))
+        sums = like.new_zeros(0, len(SUMS))
     elif "weights" in options.sums:
         assert options.pixel_weights is not None, "sums of weights without weights"
-        found = sums_over_pixels(seen, options.pixel_weights.detach().to(like).contiguous().view(-1))
+        sums = sums_over_pixels(seen, options.pixel_weights.detach().to(like).contiguous().view(-1))
     else:
-        found = sums_over_pixels(seen, seen.image)  # any numbers
-    sums = {name: found[:, i].contiguous() for i, name in enumerate(SUMS) if name in options.sums}
-    if "counts" in sums:
-        sums["counts"] = sums["counts"].int()
-    return Contributions(**sums)
+        sums = sums_over_pixels(seen, seen.image)  # any numbers
+    by_name = {name: sums[:, i].contiguous() for i, name in enumerate(SUMS) if name in options.sums}
+    if "counts" in by_name:
+        by_name["counts"] = by_name["counts"].int()
+    return Contributions(**by_name)
 
 
 class _Blending(Blending):

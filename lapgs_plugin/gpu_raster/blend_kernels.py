@@ -115,15 +115,15 @@ def _forward_kernel(
         _, there, x, y, a, b, c, opacity, color_r, color_g, color_b, inverse_z = following
     tl.store(counts + tl.program_id(0), tl.minimum(head, tail))
 
-    place = (row + down) * width + column + along
-    at_red, at_green, at_blue = pixels_of(image, place, width * height, family)
+    pixel = (row + down) * width + column + along
+    at_red, at_green, at_blue = pixels_of(image, pixel, width * height, family)
     left = 1.0 - tl.sum(cover, 1, keep_dims=True)
     background += of_background * image
     tl.store(images + at_red, tl.sum(red, 1, keep_dims=True) + left * tl.load(background), inside)
     tl.store(images + at_green, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
     tl.store(images + at_blue, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
     if depth:
-        tl.store(inverse_depths + place, tl.sum(near, 1, keep_dims=True), inside)
+        tl.store(inverse_depths + pixel, tl.sum(near, 1, keep_dims=True), inside)
 
 
 @triton.jit
@@ -131,7 +131,7 @@ def _add_gradients(
     x: tl.tensor, y: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, opacity: tl.tensor,
     by_sigma: tl.tensor, by_red: tl.tensor, by_green: tl.tensor, by_blue: tl.tensor,
     by_inverse_z: tl.tensor, gaussian: tl.tensor, there: tl.tensor, gradients: tl.tensor, others: tl.tensor,
-    absolute: tl.constexpr, depth: tl.constexpr, each: tl.constexpr,
+    absolute: tl.constexpr, depth: tl.constexpr, stride: tl.constexpr,
 ) -> None:  # fmt: skip
     """Add a bucket's gradients, summed over pixels, to those of all tiles.
 
@@ -162,9 +162,9 @@ def _add_gradients(
         wanted = lane < 3
     if depth:
         total = tl.sum(tl.sum(by_inverse_z, 3, keep_dims=True), 0, keep_dims=True)
-        value = tl.where(lane == each // 2 + 1, total, value)
-        wanted = wanted | (lane == each // 2 + 1)
-    tl.atomic_add(others + each * gaussian + lane, tl.where(wanted, value, 0.0), there & wanted, sem="relaxed")
+        value = tl.where(lane == stride // 2 + 1, total, value)
+        wanted = wanted | (lane == stride // 2 + 1)
+    tl.atomic_add(others + stride * gaussian + lane, tl.where(wanted, value, 0.0), there & wanted, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
@@ -174,7 +174,7 @@ def _backward_kernel(
     gradients: tl.tensor, others: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr,
-    absolute: tl.constexpr, family: tl.constexpr, depth: tl.constexpr, each: tl.constexpr,
+    absolute: tl.constexpr, family: tl.constexpr, depth: tl.constexpr, stride: tl.constexpr,
 ) -> None:  # fmt: skip
     # Tensors have the axes (LANES, SPLAT_LANES, splats, rows). Triton spreads the first axes over threads, because it
     # finds no order in the addresses of Gaussians. So the last two are registers of a thread, and sums over rows and
@@ -185,16 +185,16 @@ def _backward_kernel(
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
-    place = (row + down) * width + column + along
-    at_red, at_green, at_blue = pixels_of(image, place, width * height, family)
+    pixel = (row + down) * width + column + along
+    at_red, at_green, at_blue = pixels_of(image, pixel, width * height, family)
     red = tl.load(by_images + at_red, inside, 0.0)
     green, blue = tl.load(by_images + at_green, inside, 0.0), tl.load(by_images + at_blue, inside, 0.0)
     behind = red * tl.load(images + at_red, inside, 0.0)
     behind += green * tl.load(images + at_green, inside, 0.0) + blue * tl.load(images + at_blue, inside, 0.0)
     near = inside * 0.0
     if depth:
-        near = tl.load(by_depths + place, inside, 0.0)
-        behind += near * tl.load(inverse_depths + place, inside, 0.0)
+        near = tl.load(by_depths + pixel, inside, 0.0)
+        behind += near * tl.load(inverse_depths + pixel, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
     second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
@@ -236,7 +236,7 @@ def _backward_kernel(
             by_sigma = tl.where(alpha < OPAQUEST, by_sigma, 0.0)
         _add_gradients(
             x, y, a, b, c, opacity, by_sigma, weight * red, weight * green, weight * blue, weight * near,
-            gaussian, there, gradients, others, absolute, depth, each,
+            gaussian, there, gradients, others, absolute, depth, stride,
         )  # fmt: skip
 
 
@@ -328,18 +328,19 @@ def blend_backward(
     """
     programs, numbers = launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
     assert len(counts) == programs
-    count, each = records.numel() // RECORD, OTHERS[absolute, rules.depth]
-    zeros = records.new_zeros((GRADIENT + each) * count)  # in one launch
+    count, stride = records.numel() // RECORD, OTHERS[absolute, rules.depth]
+    zeros = records.new_zeros((GRADIENT + stride) * count)  # in one launch
     found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     launch(
         _backward_kernel, (programs,),
         records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)), found, others,
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        absolute=absolute, family=rules.family, depth=rules.depth, each=each, num_warps=1, maxnreg=BACKWARD_REGISTERS,
+        absolute=absolute, family=rules.family, depth=rules.depth, stride=stride, num_warps=1,
+        maxnreg=BACKWARD_REGISTERS,
     )  # fmt: skip
     leading = records.shape[:-1]
-    return found.view(*leading, GRADIENT), others.view(*leading, each)
+    return found.view(*leading, GRADIENT), others.view(*leading, stride)
 
 
 def _size_of(images: Tensor, rules: Rules) -> tuple[int, int]:

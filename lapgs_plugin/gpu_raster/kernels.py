@@ -445,11 +445,11 @@ def _dimming_backward(
 
 @triton.jit
 def _by_depth(
-    others: tl.tensor, inverse: tl.tensor, visible: tl.tensor, each: tl.constexpr, depth: tl.constexpr
+    others: tl.tensor, inverse: tl.tensor, visible: tl.tensor, stride: tl.constexpr, depth: tl.constexpr
 ) -> tl.tensor:
     """Return the gradient by depth from that by its inverse, which is among the others if there is one."""
     if depth:
-        return tl.where(visible, -tl.load(others + (each // 2 + 1)), 0.0) * inverse * inverse
+        return tl.where(visible, -tl.load(others + (stride // 2 + 1)), 0.0) * inverse * inverse
     return 0.0 * inverse
 
 
@@ -460,7 +460,7 @@ def _shape_gradient_kernel(
     by_mean: tl.tensor, by_quaternion: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
     by_color: tl.tensor, by_screen: tl.tensor,
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
-    record: tl.constexpr, gradient: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
+    record: tl.constexpr, gradient: tl.constexpr, stride: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
     dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr,
 ) -> None:  # fmt: skip
@@ -480,7 +480,7 @@ def _shape_gradient_kernel(
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
         red, green, blue, of_opacity = load_four(found + placed * gradient)
         of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
-        of_high = tl.load(others + placed * each)
+        of_high = tl.load(others + placed * stride)
         _, _, conic_a, conic_b = load_four(records + placed * record)
         conic_c = tl.load(records + placed * record + 4)
         of_opacity = tl.where(visible, of_opacity, 0.0)
@@ -505,14 +505,14 @@ def _shape_gradient_kernel(
         gx, gy, gz = _times(xx, xy, xz, yy, yz, zz, gx, gy, gz)
         right, under, ahead = _grad_of_mean(
             poses + 16 * camera, u, v, limited_u, limited_v, inverse, x_by_x, y_by_y, of_x, of_y,
-            _by_depth(others + placed * each, inverse, visible, each, depth), fx, fy, fz, gx, gy, gz, family,
+            _by_depth(others + placed * stride, inverse, visible, stride, depth), fx, fy, fz, gx, gy, gz, family,
         )  # fmt: skip
         by_x, by_y, by_z = by_x + right, by_y + under, by_z + ahead
         if colored:
             red, green = tl.where(visible, red, 0.0), tl.where(visible, green, 0.0)
             store_three(by_color + 3 * rows, red, green, tl.where(visible, blue, 0.0), here)
         if columns > 0:
-            _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * each, 0.5 * width,
+            _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * stride, 0.5 * width,
                                     0.5 * height, visible, here, columns)  # fmt: skip
         camera += 1
     store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
@@ -607,12 +607,12 @@ def project(
     count, n, like = len(cameras.poses), len(given.means), given.means
     integers = like.new_empty(count, n, 2, dtype=torch.int32)
     described = n if with_geometry else 0
-    made = Projected(
+    projected = Projected(
         integers, like.new_empty(count, 0 if rules.family else n, 2), like.new_empty(count, n),
         like.new_empty(count, n, RECORD), integers.new_empty(count, described), like.new_empty(count, described, 2),
     )  # fmt: skip
-    _project(given, first, cameras, (0, count), degree, signed, made, 0, with_geometry, rules, numbers)
-    return made
+    _project(given, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
+    return projected
 
 
 def project_into(
@@ -626,9 +626,9 @@ def project_into(
         camera: number of its camera; its size is that of all.
         given, cameras, signed: as `project` takes them; all coefficients are evaluated.
     """
-    made = Projected(*stacked, *stacked[:2])
+    projected = Projected(*stacked, *stacked[:2])
     degree = math.isqrt(given.sh.shape[1]) - 1
-    _project(given, None, cameras, (camera, 1), degree, signed, made, start, False, GSPLAT, NUMBERS)
+    _project(given, None, cameras, (camera, 1), degree, signed, projected, start, False, GSPLAT, NUMBERS)
 
 
 def _coefficients(sh: Tensor, rules: Rules) -> int:
@@ -700,7 +700,7 @@ def _project_backward(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
         *given[:4], *cameras[:2], radii, records, found, others, *by, by.means if by_screen is None else by_screen,
         cameras.width, cameras.height, n, count, *numbers[:2],
-        record=RECORD, gradient=GRADIENT, each=others.shape[-1], block=BLOCK, colored=coefficients == 0,
+        record=RECORD, gradient=GRADIENT, stride=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
         dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth,
     )  # fmt: skip

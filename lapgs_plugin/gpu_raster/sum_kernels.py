@@ -83,7 +83,7 @@ def _sum_kernel(
     by_images: tl.tensor, weights: tl.tensor, sums: tl.tensor, queues: tl.tensor,
     width: int, height: int, across: int, tiles: int, known: int, pairs: int,
     rows: tl.constexpr, splats: tl.constexpr, tile: tl.constexpr, record: tl.constexpr, what: tl.constexpr,
-    each: tl.constexpr,
+    stride: tl.constexpr,
 ) -> None:  # fmt: skip
     # Axes as in the backward kernel of blending.
     bucket: tl.constexpr = splats * SPLAT_LANES
@@ -92,16 +92,16 @@ def _sum_kernel(
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
-    place = (row + down) * width + column + along
+    pixel = (row + down) * width + column + along
     transmittance = tl.where(inside, 1.0, 0.0)
     if what == SQUARES:
-        at_red, at_green, at_blue = pixels_of(image, place, width * height, True)
+        at_red, at_green, at_blue = pixels_of(image, pixel, width * height, True)
         by_red = tl.load(by_images + at_red, inside, 0.0)
         by_green, by_blue = tl.load(by_images + at_green, inside, 0.0), tl.load(by_images + at_blue, inside, 0.0)
         behind = by_red * tl.load(images + at_red, inside, 0.0)
         behind += by_green * tl.load(images + at_green, inside, 0.0) + by_blue * tl.load(images + at_blue, inside, 0.0)
     else:
-        of_pixel = tl.load(weights + place, inside, 0.0)
+        of_pixel = tl.load(weights + pixel, inside, 0.0)
 
     count = tl.load(counts + tl.program_id(0))
     begin, stop = pairs_of(index, offsets, known, pairs)
@@ -124,18 +124,18 @@ def _sum_kernel(
         alpha = tl.where(after > LEAST, alpha, 0.0)  # the pixel ends before
         share = alpha * before
         if what == OF_SUMS:
-            _add_sums(share, of_pixel, tl.sqrt(x * x + y * y), sums + each * gaussian, there)
+            _add_sums(share, of_pixel, tl.sqrt(x * x + y * y), sums + stride * gaussian, there)
         else:
             if what == SQUARES:
                 shade = red * by_red + green * by_green + blue * by_blue
                 slope, behind = _slopes(share * shade, before * shade, behind, inverse)
-                found = tl.where(alpha > 0.0, opacity * slope, 0.0)
-                found *= found
+                value = tl.where(alpha > 0.0, opacity * slope, 0.0)
+                value *= value
             else:
-                found = share * (1.0 - alpha) * of_pixel
-            total = tl.sum(tl.sum(found, 3, keep_dims=True), 0, keep_dims=True)
+                value = share * (1.0 - alpha) * of_pixel
+            total = tl.sum(tl.sum(value, 3, keep_dims=True), 0, keep_dims=True)
             first = tl.arange(0, LANES)[:, None, None, None] == 0
-            tl.atomic_add(sums + each * gaussian, tl.where(first, total, 0.0), there & first, sem="relaxed")
+            tl.atomic_add(sums + stride * gaussian, tl.where(first, total, 0.0), there & first, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
@@ -157,11 +157,11 @@ def _leader_kernel(
     along = tl.broadcast_to(tl.arange(0, LANES)[:, None, None, None], (LANES, SPLAT_LANES, 1, 1))
     down = tl.broadcast_to(tl.arange(0, rows)[None, None, None, :], (LANES, SPLAT_LANES, 1, rows))
     inside = (column + along < width) & (row + down < height)
-    place = (row + down) * width + column + along
+    pixel = (row + down) * width + column + along
     transmittance = tl.where(inside, 1.0, 0.0)
     cover, best = inside * 0.0, inside * 0.0
     leader, first = tl.where(inside, -1, -1), tl.where(inside, LAST, LAST)
-    limit, after_order = tl.load(shares + place, inside, 0.0), tl.load(orders + place, inside, 0)
+    limit, after_order = tl.load(shares + pixel, inside, 0.0), tl.load(orders + pixel, inside, 0)
     within = tl.arange(0, SPLAT_LANES)[None, :, None, None] * splats + tl.arange(0, splats)[None, None, :, None]
 
     count = tl.load(counts + tl.program_id(0))
@@ -196,10 +196,10 @@ def _leader_kernel(
     in_front = tl.min(tl.where(best == largest, first, LAST), 1, keep_dims=True)
     which = tl.max(tl.where((best == largest) & (first == in_front), leader, -1), 1, keep_dims=True)
     wanted = inside & (tl.arange(0, SPLAT_LANES)[None, :, None, None] == 0)
-    tl.store(leaders + place, tl.broadcast_to(which, inside.shape), wanted)
-    tl.store(shares + place, tl.broadcast_to(largest, inside.shape), wanted)
-    tl.store(orders + place, tl.broadcast_to(in_front, inside.shape), wanted)
-    tl.store(left + place, tl.broadcast_to(1.0 - tl.sum(cover, 1, keep_dims=True), inside.shape), wanted)
+    tl.store(leaders + pixel, tl.broadcast_to(which, inside.shape), wanted)
+    tl.store(shares + pixel, tl.broadcast_to(largest, inside.shape), wanted)
+    tl.store(orders + pixel, tl.broadcast_to(in_front, inside.shape), wanted)
+    tl.store(left + pixel, tl.broadcast_to(1.0 - tl.sum(cover, 1, keep_dims=True), inside.shape), wanted)
 
 
 def _launch(kernel: object, seen: Blended, *more: Tensor, **constants: int) -> None:
@@ -214,7 +214,7 @@ def _launch(kernel: object, seen: Blended, *more: Tensor, **constants: int) -> N
 
 def _sum(seen: Blended, weights: Tensor, by_image: Tensor, columns: int, what: int) -> Tensor:
     sums = seen.records.new_zeros(seen.records.numel() // RECORD, columns)
-    _launch(_sum_kernel, seen, seen.image, by_image, weights, sums, what=what, each=columns)
+    _launch(_sum_kernel, seen, seen.image, by_image, weights, sums, what=what, stride=columns)
     return sums
 
 
@@ -251,9 +251,9 @@ def leaders(seen: Blended, ranks: int) -> tuple[Tensor, Tensor]:
     Where fewer are blended, the others are -1.
     """
     pixels = seen.size[0] * seen.size[1]
-    found = seen.flat.new_empty(ranks, pixels)
+    leading = seen.flat.new_empty(ranks, pixels)
     shares, orders = seen.image.new_full((pixels,), torch.inf), seen.flat.new_full((pixels,), -1)
     left = seen.image.new_empty(pixels)
-    for rank in found:
+    for rank in leading:
         _launch(_leader_kernel, seen, rank, shares, orders, left)
-    return found, left
+    return leading, left

@@ -308,13 +308,13 @@ def alphas_of(
 
 @triton.jit
 def pixels_of(
-    image: tl.tensor, place: tl.tensor, size: tl.tensor, planar: tl.constexpr
+    image: tl.tensor, pixel: tl.tensor, size: tl.tensor, planar: tl.constexpr
 ) -> tuple[tl.tensor, tl.tensor, tl.tensor]:
     """Return where red, green and blue of pixels are in images (c, h, w, 3), or (c, 3, h, w) if `planar`."""
     start = 3 * (image.to(tl.int64) * size)
     if planar:
-        return start + place, start + size + place, start + 2 * size + place
-    return start + 3 * place, start + 3 * place + 1, start + 3 * place + 2
+        return start + pixel, start + size + pixel, start + 2 * size + pixel
+    return start + 3 * pixel, start + 3 * pixel + 1, start + 3 * pixel + 2
 
 
 @triton.jit
