@@ -26,6 +26,7 @@ from lapgs_plugin.runs.options import PANEL, MeasuringOptions
 if TYPE_CHECKING:
     from lapgs_plugin.adapters.base import BackboneAdapter
     from lapgs_plugin.checkouts.compiled_modules import CompiledModules
+    from lapgs_plugin.checkouts.splat_script import SplatScript
     from lapgs_plugin.runs.watcher import Watcher
 
 OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "rasterizer", "verbose", "seed"}
@@ -102,6 +103,7 @@ def run(
     """
     from lapgs_plugin.checkouts.script import require_script
     from lapgs_plugin.checkouts.source import OTHERWISE, CheckoutSource
+    from lapgs_plugin.checkouts.splat_script import SplatScript
     from lapgs_plugin.environment.device import chosen_device
     from lapgs_plugin.runner.installed_packages import require_packages
 
@@ -113,7 +115,9 @@ def run(
         raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
     # What is refused by the sources alone is refused before PyTorch is imported.
     path, words = require_script(script), arguments or []
-    kind = _recognised(script, options.backbone, needed=not plain or options.rasterizer != packages.AUTO)
+    splats = SplatScript.read(path) if options.backbone is None else None
+    needed = not plain or options.rasterizer != packages.AUTO
+    kind = _recognised(script, options.backbone, needed=needed) if splats is None else None
     if kind is not None and not options.off:
         source = CheckoutSource.read(script)
         if why := source.hindrance(kind.archived_parameters()):
@@ -136,7 +140,50 @@ def run(
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.WARNING)  # of the preview
     attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
     attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
+    if splats is not None:
+        _execute_splats(splats, words, device, options, settings, measuring, watcher)
+        return
     _execute(path, words, kind, device, options, settings, measuring, watcher)
+
+
+def _execute_splats(
+    described: SplatScript,
+    arguments: Sequence[str],
+    device: str,
+    options: ScriptOptions,
+    settings: RunSettings,
+    measuring: MeasuringOptions,
+    watcher: Watcher,
+) -> None:
+    """Execute a script whose class trains splats: with a hierarchy, or unchanged with --off."""
+    from lapgs_plugin.checkouts.script import loaded_script
+    from lapgs_plugin.checkouts.seeds import moved_seeds
+    from lapgs_plugin.errors import MissingExtraError, first_line
+    from lapgs_plugin.runner.splats.driver import SplatDriver, run_bare
+    from lapgs_plugin.runner.splats.on_cpu import splats_on_cpu
+    from lapgs_plugin.runner.splats.run import SplatRequest
+    from lapgs_plugin.viewer.preview import save_run_preview
+
+    path = described.path
+    if options.record:
+        raise UserInputError(f"--record: {path} records its time and quality itself, in stats/; leave it out")
+    on_device: AbstractContextManager[None] = splats_on_cpu() if device == "cpu" else nullcontext()
+    try:
+        with on_device, moved_seeds(settings.seed), loaded_script(path, arguments) as loaded:
+            if options.off:
+                run_bare(loaded, described, device)
+                return
+            request = SplatRequest(
+                loaded, described, settings, device, options.resume, options.overwrite, measuring, watcher
+            )
+            folder = SplatDriver(request).run()
+        if folder is not None:
+            save_run_preview(folder, device)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"{path} needs {error.name}, which is not installed ({first_line(error)}); install what its "
+            "requirements.txt lists, in this environment"
+        ) from error
 
 
 def _execute(

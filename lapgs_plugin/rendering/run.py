@@ -77,7 +77,10 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
     with _errors_about_scene(archive, moved_to):
         scene = load_reference(replace(reference, path=str(path)), hold=False)
     require_same_scene(archive, scene.path, scene.smallest_size)
-    return replace(scene, train=refined_views(archive, scene.train), test=refined_views(archive, scene.test))
+    views = {view.name: view for view in (*scene.train, *scene.test)}
+    cameras = (refined(archive, each) for each in _as_trained(archive, *map(_by_name, (scene.train, scene.test))))
+    train, test = (tuple(views[name].at(camera) for name, camera in each.items()) for each in cameras)
+    return replace(scene, train=train, test=test)
 
 
 def _errors_about_scene(archive: RunArchive, moved_to: Path | None) -> AbstractContextManager[None]:
@@ -109,7 +112,31 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     with _errors_about_scene(archive, moved_to):
         train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
     require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
+    train, test = _as_trained(archive, train, test)
     return refined(archive, train), refined(archive, test)
+
+
+def _by_name(views: Sequence[View]) -> dict[str, Camera]:
+    return {view.name: view.camera for view in views}
+
+
+def _as_trained(
+    archive: RunArchive, train: Mapping[str, Camera], test: Mapping[str, Camera]
+) -> tuple[dict[str, Camera], dict[str, Camera]]:
+    """Return cameras by view name as the run's script had them, where they are not those of the scene.
+
+    Raises:
+        RunFolderError: the scene lacks a view of the run, or the file is damaged.
+    """
+    own = archive.cameras()
+    if own is None:
+        return dict(train), dict(test)
+    if missing := next((name for name in {**own.train, **own.test} if name not in {**train, **test}), None):
+        raise RunFolderError(
+            f"{archive.path()} was trained on {missing}, which its scene does not have any more; give the scene of the "
+            "run with --scene"
+        )
+    return dict(own.train), dict(own.test)
 
 
 def refined(archive: RunArchive, cameras: Mapping[str, Camera]) -> dict[str, Camera]:

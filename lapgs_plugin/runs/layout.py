@@ -1,6 +1,7 @@
 """Name the files of run folders, and tell and clear such folders.
 
     RUN/manifest.json              everything needed to render the run again
+    RUN/view_cameras.json          cameras of the run's views where they are not those of its scene
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/level_<l>/view_colors.json colour transforms of the training photos after that level, if exposure is compensated
@@ -48,6 +49,7 @@ from lapgs_plugin.untrusted import TEXT_BYTES, read_json
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
+CAMERAS = "view_cameras.json"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
@@ -148,7 +150,7 @@ def exists(path: Path) -> bool:
 
 def require_own_results(folder: Path) -> None:
     """Check that all that is written in a run folder is its own, see `files.require_own_entries`."""
-    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG)
+    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS)
     with one_line_errors(folder, "read"):
         levels = [path.name for path in folder.glob("level_*")]
     require_own_entries(folder, (*files, RENDERS, EXPORT, TENSORBOARD, CACHE, *levels))
@@ -187,7 +189,7 @@ def has_begun(folder: Path) -> bool:
 def remove_results(folder: Path) -> None:
     """Remove the files of a previous run and nothing else."""
     remove_scratch(folder)
-    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG):
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS):
         (folder / name).unlink(missing_ok=True)
     for name in (RENDERS, EXPORT, TENSORBOARD):
         if (folder / name).is_dir():

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from lapgs_plugin.errors import RunFolderError, printable
 from lapgs_plugin.files import FolderLock, one_line_errors, require_own_entries, write_text
-from lapgs_plugin.runs.layout import CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
+from lapgs_plugin.runs.layout import CAMERAS, CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import HistoryEntry, Metrics
 from lapgs_plugin.runs.tensors import read_tensors, write_tensors
+from lapgs_plugin.runs.trained_cameras import CameraTable, TrainedCameras
 from lapgs_plugin.untrusted import checked, read_json, read_json_lines, shortened
 
 if TYPE_CHECKING:
@@ -127,6 +128,23 @@ class RunFiles:
         path = self.path(METRICS)
         advice = "write it again with `lapgs eval`"
         return dict(read_json(path, Metrics, error=RunFolderError, advice=advice)) if exists(path) else None
+
+    def write_cameras(self, cameras: TrainedCameras) -> None:
+        """Replace the cameras of the run's views."""
+        self._require_lock()
+        self._write_json(self.path(CAMERAS), cameras.as_json(), training=True)
+
+    def cameras(self) -> TrainedCameras | None:
+        """Read the cameras of the run's views; None if they are those of its scene.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        path = self.path(CAMERAS)
+        if not exists(path):
+            return None
+        table = read_json(path, CameraTable, error=RunFolderError, advice="train again with --overwrite")
+        return TrainedCameras.from_json(table, str(path))
 
     def save_checkpoint(self, state: dict[str, Any], extends_to: int | None = None) -> None:
         """Replace the checkpoint of the level in training.

@@ -1,0 +1,50 @@
+"""Recognise a script whose class trains splats through gsplat's `rasterization`. Executes nothing, imports no torch."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+from lapgs_plugin.checkouts.syntax import called_names, executed_on_import, parsed
+
+RASTERIZATION = "rasterization"
+"""Function of gsplat that the script imports by name."""
+RASTERIZE = "rasterize_splats"
+"""Method that calls it."""
+METHODS = {"__init__", "train", RASTERIZE}
+
+
+@dataclass(frozen=True)
+class SplatScript:
+    """Name the class of a script that trains splats, as those of gsplat's examples and of programs made from them.
+
+    Attributes:
+        path: of the script.
+        trainer: name of its class with `METHODS`.
+    """
+
+    path: Path
+    trainer: str
+
+    @classmethod
+    def read(cls, path: Path) -> SplatScript | None:
+        """Return the description of a script; None if it is of another kind.
+
+        Raises:
+            UserInputError: it is not Python.
+        """
+        tree = parsed(path)
+        imports = [node for node in executed_on_import(tree.body) if isinstance(node, ast.ImportFrom)]
+        rasterizes = any(
+            (node.module or "").partition(".")[0] == "gsplat" and RASTERIZATION in {each.name for each in node.names}
+            for node in imports
+        )
+        trainers = [node for node in tree.body if isinstance(node, ast.ClassDef) and _trains(node)]
+        return cls(path, trainers[0].name) if rasterizes and trainers else None
+
+
+def _trains(node: ast.ClassDef) -> bool:
+    """Return whether a class has the methods, of which the one that rasterizes calls `RASTERIZATION`."""
+    methods = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+    return methods.keys() >= METHODS and RASTERIZATION in called_names(ast.walk(methods[RASTERIZE]))

@@ -1,0 +1,1 @@
+"""Train levels in scripts whose class trains splats with gsplat's `rasterization`."""

@@ -1,0 +1,65 @@
+"""Change a script's settings for one stage of a run with residuals."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from lapgs_plugin.checkouts.training_call import StageWindow
+from lapgs_plugin.hierarchy.settings import HierarchySettings
+
+THRESHOLD = "grow_grad2d"
+"""Threshold of gsplat's DefaultStrategy on screen-space gradients."""
+NEVER = 10**9
+"""An interval that no run reaches."""
+FREE_SHARE = 0.02
+"""Share of a residual's densification without a weight of mean opacity: it starts without colour, so that nothing holds
+its opacities against the weight."""
+FREE_VIEWS = 80
+"""Training views from which on that weight is smaller, in proportion to 1 / views."""
+
+
+def stage_config(config: Any, window: StageWindow, result_dir: str, settings: HierarchySettings) -> Any:
+    """Return a script's settings for one stage: schedule scaled to its length, its own output folder, its rates.
+
+    Args:
+        config: settings of the whole run.
+        window: the stage.
+        result_dir: of its outputs.
+        settings: of the hierarchy.
+    """
+    own, stage = copy.copy(config), window.stage
+    own.strategy = copy.copy(config.strategy)
+    own.result_dir, own.max_steps = result_dir, stage.iterations
+    for name in ("eval_steps", "save_steps", "ply_steps"):
+        if hasattr(own, name):
+            setattr(own, name, window.local(getattr(own, name)))
+    for name, value in vars(own.strategy).items():
+        if name.endswith("_stop_iter") and value > 0:
+            setattr(own.strategy, name, window.scaled(value))
+    set_threshold(own.strategy, config.strategy, window.threshold_factor)
+    if stage.signed:
+        if hasattr(own.strategy, "reset_every") and not settings.residual_resets:
+            own.strategy.reset_every = NEVER
+        for name in ("sh0_lr", "shN_lr"):
+            setattr(own, name, getattr(own, name) * window.residual_color_rate)
+    return own
+
+
+def set_threshold(strategy: Any, of_run: Any, factor: float) -> None:
+    """Set a strategy's threshold of densification to that of the run's, times a factor; MCMC has none."""
+    if hasattr(of_run, THRESHOLD):
+        setattr(strategy, THRESHOLD, getattr(of_run, THRESHOLD) * factor)
+
+
+def opacity_weight(config: Any, iteration: int, of_run: float, views: int) -> float:
+    """Return the weight of mean opacity in a residual's iteration.
+
+    Args:
+        config: settings of its stage.
+        iteration: from 1.
+        of_run: weight that the user chose.
+        views: number of training views.
+    """
+    free = FREE_SHARE * getattr(config.strategy, "refine_stop_iter", config.max_steps)
+    return 0.0 if iteration <= free else of_run * min(1.0, FREE_VIEWS / views)

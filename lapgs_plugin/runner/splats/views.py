@@ -1,0 +1,126 @@
+"""Read the views of a script's datasets once, and make its batches of them at a level's size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, default_collate
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.hierarchy.cameras import level_intrinsics
+from lapgs_plugin.hierarchy.plan import level_size
+from lapgs_plugin.runs.level_images import LevelImages
+from lapgs_plugin.scenes.parallel import in_threads
+
+IMAGE, MASK, POINTS = "image", "mask", "points"
+"""Entries of a dataset's item that depend on the image's size, besides "K"."""
+
+
+@dataclass(frozen=True)
+class SplatView:
+    """Hold a view of a dataset.
+
+    Attributes:
+        name: of its image.
+        item: what the dataset returned, without the image.
+        pixels: (h, w, 3) uint8, on the CPU.
+    """
+
+    name: str
+    item: Mapping[str, Any]
+    pixels: Tensor  # (h, w, 3)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    @property
+    def image(self) -> Tensor:
+        """The image (3, h, w) in [0, 1]."""
+        return self.pixels.permute(2, 0, 1) / 255
+
+    @property
+    def mask(self) -> Tensor | None:
+        """The mask (1, h, w) bool; None without one."""
+        return self.item[MASK][None] if MASK in self.item else None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera at full size."""
+        (fx, _, cx), (_, fy, cy), _ = self.item["K"].tolist()
+        pose = torch.linalg.inv(self.item["camtoworld"].double()).float()
+        return Camera(*self.size, fx, fy, cx, cy, pose)
+
+
+def read_views(dataset: Any, names: Sequence[str], progress: bool = True) -> list[SplatView]:
+    """Return the views of a dataset, whose items have at least "image" (h, w, 3) from 0 to 255, "K" and "camtoworld".
+
+    Args:
+        dataset: of the script.
+        names: of the images, in its order.
+        progress: whether a bar is shown.
+
+    Raises:
+        UserInputError: an image has values that are no 8-bit ones.
+    """
+
+    def read(index: int) -> SplatView:
+        item = dict(dataset[index])
+        image = item.pop(IMAGE)
+        pixels = image.to(torch.uint8)
+        if not torch.equal(pixels.to(image), image):
+            raise UserInputError(
+                f"{names[index]} has values that are no whole numbers from 0 to 255, expected an 8-bit image; convert "
+                "it, or train with `lapgs run --off`"
+            )
+        return SplatView(names[index], item, pixels)
+
+    return in_threads("Reading images", "images", read, range(len(dataset)), progress=progress)
+
+
+class LevelBatches:
+    """Make the batches of a script's training loop from its views at the running level's size.
+
+    Takes the place of its `DataLoader`, in whose order views are drawn. Nothing is made ahead, because the level may
+    change between two batches.
+
+    Args:
+        count: number of views.
+        item: returns a view's item at the running level, by index.
+        begins: called before each batch.
+        batch_size, shuffle: as of `DataLoader`.
+    """
+
+    def __init__(
+        self, count: int, item: Callable[[int], Any], begins: Callable[[], None], batch_size: int, shuffle: bool
+    ) -> None:
+        self._order: DataLoader[int] = DataLoader(range(count), batch_size, shuffle)  # type: ignore[arg-type]
+        self._item, self._begins = item, begins
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __iter__(self) -> Iterator[Any]:
+        for batch in self._order:
+            self._begins()
+            yield default_collate([self._item(index) for index in batch.tolist()])
+
+
+def level_item(view: SplatView, level: int, images: LevelImages) -> dict[str, Any]:
+    """Return what a dataset would return of a view if its images had a level's size."""
+    size = level_size(view.size, level)
+    item = {**view.item, "K": level_intrinsics(view.item["K"], view.size, level)}
+    item[IMAGE] = images.targets.get(view.name).permute(1, 2, 0) * 255
+    if (weights := images.get_weights(view.name)) is not None and MASK in item:
+        item[MASK] = weights[0] > 1 - 0.5 / 255
+    if POINTS in item:  # (m, 2) in pixels
+        item[POINTS] = item[POINTS] * item[POINTS].new_tensor(
+            [part / of for part, of in zip(size, view.size, strict=True)]
+        )
+    return item
