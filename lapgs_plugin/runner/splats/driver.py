@@ -6,7 +6,7 @@ replaced, and restored by identity at the end:
 
     `train` of the class                                as above
     `rasterization`, as the script imports it           signed colours, and coarser levels in the image
-    `torch.utils.data.DataLoader`, of training views    batches of the level's images, which are in memory
+    `torch.utils.data.DataLoader`, of its datasets      batches of the level's images, which are in memory
     `__init__` of the class, `Parser`                   read a scene once
     `eval` and the like of the class                    do not count as training
     `cli`, as the script imports it                     stays in this process, on one GPU
@@ -22,7 +22,7 @@ import os
 import shlex
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -148,9 +148,12 @@ class SplatDriver:
     def _loading(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def load(dataset: Any, batch_size: int = 1, shuffle: bool = False, **others: Any) -> Any:
-            if self._stage is None or dataset is not self._run.trainer.trainset:
+            if self._stage is None or dataset not in (self._run.trainer.trainset, self._run.trainer.valset):
                 return original(dataset, batch_size=batch_size, shuffle=shuffle, **others)
-            return LevelBatches(len(dataset), self._item, self._iteration_begins, batch_size, shuffle)
+            if dataset is self._run.trainer.valset:  # read once in a while: processes for it take longer to start
+                return original(dataset, batch_size=batch_size, shuffle=shuffle)
+            persistent = bool(others.get("persistent_workers"))
+            return LevelBatches(len(dataset), self._item, self._iteration_begins, batch_size, shuffle, persistent)
 
         return load
 
@@ -246,8 +249,9 @@ class SplatDriver:
         self._stage = None
 
     def _remake(self, stage: Stage) -> None:
-        """Make the script's trainer anew for one stage; its viewer stays."""
+        """Make the script's trainer anew for one stage; its viewer stays, and what it learned beside the splats."""
         run, trainer = self._run, self._run.trainer
+        learned = {name: module.state_dict() for name, module in _beside_splats(trainer).items()}
         folder = run.config.result_dir if stage.level == 0 else str(run.archive.path(f"level_{stage.level}"))
         config = stage_config(run.config, run.window(stage), folder, run.settings)
         if hasattr(config, VIEWERLESS):
@@ -263,6 +267,9 @@ class SplatDriver:
         )
         if hasattr(config, VIEWERLESS):
             setattr(config, VIEWERLESS, getattr(run.config, VIEWERLESS))
+        for name, module in _beside_splats(trainer).items():
+            if name in learned and _shapes(learned[name]) == _shapes(module.state_dict()):
+                module.load_state_dict(learned[name])
         self._scale_sh_rate()
 
     def _inherit(self, coarser: GaussianField) -> None:
@@ -282,6 +289,17 @@ class SplatDriver:
             group["lr"] *= rate
 
 
+def _beside_splats(trainer: Any) -> dict[str, torch.nn.Module]:
+    """Return a trainer's modules without splats, such as corrections of poses and exposure, by attribute."""
+    splats = set(map(id, trainer.splats.values()))
+    modules = {name: value for name, value in vars(trainer).items() if isinstance(value, torch.nn.Module)}
+    return {name: each for name, each in modules.items() if not splats & set(map(id, each.parameters()))}
+
+
+def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: getattr(value, "shape", None) for name, value in state.items()}
+
+
 def _single_process(script: Script) -> list[Replacement]:
     """Return the replacement of the function that starts a process for each GPU, if a script has it."""
     if not callable(vars(script.module).get("cli")):
@@ -299,7 +317,7 @@ def _in_process(main: Callable[..., Any], config: Any, verbose: bool = False) ->
 def _rasterizer(device: str, rasterization: Any) -> Rasterizer:
     """Return the functions that a script renders with, or their stand-ins on a CPU."""
     if device == "cpu":
-        from lapgs_plugin.reference_raster.standins import gsplat as stand_in
+        from lapgs_plugin.reference_raster import gsplat as stand_in
         from lapgs_plugin.runner.splats.on_cpu import rasterization_on_cpu
 
         return Rasterizer(rasterization_on_cpu, stand_in.spherical_harmonics)

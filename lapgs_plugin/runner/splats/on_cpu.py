@@ -1,4 +1,4 @@
-"""Let a script around gsplat run on a CPU: its `rasterization` and the CUDA functions of its packages stood in for."""
+"""Let a script around gsplat run on a CPU, with stand-ins of `rasterization` and of its packages' CUDA functions."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.attachment import replaced
 from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+from lapgs_plugin.family import fused_ssim as ssim
+from lapgs_plugin.family.forks import compute_relocation
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.pose import with_pose_gradient
+from lapgs_plugin.reference_raster import gsplat as stand_in
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.reference_raster.oracle import world_covariances
-from lapgs_plugin.reference_raster.standins import fused_ssim as ssim
-from lapgs_plugin.reference_raster.standins import gsplat as stand_in
-from lapgs_plugin.reference_raster.standins.forks import compute_relocation
 
 IDLE = {
     "distributed", "with_ut", "with_eval3d", "ftheta_coeffs", "radial_coeffs", "tangential_coeffs",
@@ -44,6 +46,8 @@ def rasterization_on_cpu(**inputs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]
     viewmats[:, :3, 3] /= unit
     scaled = {"means": inputs["means"] / unit, "scales": inputs["scales"] / unit, "viewmats": viewmats}
     inputs = {**inputs, **scaled}
+    if viewmats.requires_grad and len(viewmats) == 1:
+        inputs = _with_pose_gradient(inputs)
     images, alphas, info = stand_in.rasterization(**inputs)
     if mode == "RGB":
         return images, alphas, info
@@ -55,6 +59,19 @@ def rasterization_on_cpu(**inputs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]
     if mode.endswith("ED"):
         depth = depth / alphas.clamp_min(1e-10)
     return (depth if mode in ("D", "ED") else torch.cat([images, depth], -1)), alphas, info
+
+
+def _with_pose_gradient(inputs: dict[str, Any]) -> dict[str, Any]:
+    """Return the inputs of one camera, whose splats also pass on gradients to its pose; the stand-in has none by it."""
+    pose, colors = inputs["viewmats"][0], inputs["colors"]
+    sh = colors if inputs["sh_degree"] is not None else colors.reshape(-1, 1, 3)
+    field = GaussianField(inputs["means"], inputs["quats"], inputs["scales"].log(), inputs["opacities"], sh)
+    rotation, centre = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    turn = rotation.detach().T @ rotation  # the identity, with the gradient of a turn about the centre
+    vector = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    movement = torch.cat([vector, centre - centre.detach()])
+    field = with_pose_gradient(field, movement, centre.detach(), 1.0)
+    return {**inputs, "means": field.means, "quats": field.quaternions, "colors": field.sh.reshape(colors.shape)}
 
 
 @contextmanager

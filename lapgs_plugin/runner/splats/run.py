@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -17,6 +17,7 @@ from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.splat_script import SplatScript
 from lapgs_plugin.checkouts.training_call import StageWindow
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan
 from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED
 from lapgs_plugin.options import option_name
@@ -25,6 +26,7 @@ from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.registry import HOOKS, chosen_entries
 from lapgs_plugin.runner.manifest import require_same_run
 from lapgs_plugin.runner.settings import RunSettings
+from lapgs_plugin.runner.splats.schedule import THRESHOLD
 from lapgs_plugin.runner.splats.signed import Rasterizer
 from lapgs_plugin.runner.splats.views import SplatView, read_views
 from lapgs_plugin.runs.archive import RunArchive
@@ -125,6 +127,14 @@ def prepare(request: SplatRequest, rasterizer: Rasterizer, trainer: Any, began: 
     settings, config = request.settings, trainer.cfg
     refuse_settings(request)
     refuse_options(config, settings.has_residuals)
+    if (
+        request.device == "cpu"
+        and hasattr(config.strategy, THRESHOLD)
+        and (size := getattr(config, "batch_size", 1)) > 1
+    ):
+        raise UserInputError(
+            f"--batch_size {size}: on a CPU the strategy by gradients gets those of one view; leave it out, or use mcmc"
+        )
     folder = Path(config.result_dir)
     if not request.resume:
         RunArchive.require_room(folder, request.overwrite, began)
@@ -283,10 +293,7 @@ def _manifest(
 
 
 @torch.no_grad()
-def write_cameras(run: SplatRun, moved: Callable[[SplatView], Any] = lambda view: view.camera) -> None:
-    """Write the cameras of all views; `moved` returns those of the training views."""
-
-    def of(views: Sequence[SplatView], camera: Callable[[SplatView], Any]) -> dict[str, Any]:
-        return {view.name: camera(view) for view in views}
-
-    run.archive.write_cameras(TrainedCameras(of(run.train, moved), of(run.test, lambda view: view.camera)))
+def write_cameras(run: SplatRun, refined: Callable[[int], Camera] | None = None) -> None:
+    """Write the cameras of all views; `refined` returns that of a training view by index where the script moved it."""
+    train = {view.name: view.camera if refined is None else refined(index) for index, view in enumerate(run.train)}
+    run.archive.write_cameras(TrainedCameras(train, {view.name: view.camera for view in run.test}))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, LapgsError, TrainingDivergedError
 from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats, require_finite
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.cameras import level_intrinsics
@@ -21,10 +23,10 @@ from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.loop_record import StageRecord
 from lapgs_plugin.runner.splats.joint import follow, trainable
-from lapgs_plugin.runner.splats.run import SplatRun
+from lapgs_plugin.runner.splats.run import SplatRun, write_cameras
 from lapgs_plugin.runner.splats.schedule import opacity_weight
 from lapgs_plugin.runner.splats.signed import COLORS, CoarserLevels, FinishedField, compose
-from lapgs_plugin.runner.splats.views import SplatView, level_item
+from lapgs_plugin.runner.splats.views import SplatView, level_item, level_pixels
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
@@ -59,6 +61,7 @@ class SplatStage:
         masked = any(view.mask is not None for view in run.train)
         self._images = LevelImages(self._stores, stage.level, self._pyramid, masked=masked)
         self._batch: list[str] = []  # views of the running iteration
+        self._items: dict[int, dict[str, Any]] = {}  # of views, without pixels
         self._opacity_weight = float(getattr(self._trainer.cfg, "opacity_reg", 0.0))
         self.iteration = 0
 
@@ -82,7 +85,9 @@ class SplatStage:
         """Return a training view for the script's next batch."""
         view = self._run.train[index]
         self._batch.append(view.name)
-        return level_item(view, self.stage.level, self._images)
+        if index not in self._items:
+            self._items[index] = level_item(view, self.stage.level, self._run.device)
+        return {**self._items[index], **level_pixels(view, self._images)}
 
     def iteration_begins(self) -> None:
         """Act before an iteration of the script's loop."""
@@ -213,6 +218,8 @@ class SplatStage:
                 "see whether `lapgs run --off` diverges too"
             ) from error
         self._record.archive(field, {}, joint)
+        if getattr(self._run.config, "pose_opt", False):
+            write_cameras(self._run, self._refined_camera)
         if self._run.test and self.stage.level <= 1:
             with self._record.after_archive("evaluation"):
                 quality = self._held_out_quality()
@@ -241,6 +248,13 @@ class SplatStage:
             (to_full_size(self._render(view).contiguous(), view.size, level, self._pyramid), view.image.to(device))
             for view in self._run.test
         )
+
+    def _refined_camera(self, index: int) -> Camera:
+        """Return the camera of a training view at the pose that the script has learned."""
+        view, device = self._run.train[index], self._run.device
+        pose = view.item["camtoworld"].to(device)[None]  # (1, 4, 4)
+        moved = self._trainer.pose_adjust(pose, torch.tensor([index], device=device))[0]
+        return replace(view.camera, world_to_camera=torch.linalg.inv(moved.double()).float().cpu())
 
     def _look(self) -> None:
         """Show the fields to the run's watcher if it wants to look."""

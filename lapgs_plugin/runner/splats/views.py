@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import BatchSampler, RandomSampler, Sampler, SequentialSampler, default_collate
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
@@ -94,33 +94,49 @@ class LevelBatches:
         count: number of views.
         item: returns a view's item at the running level, by index.
         begins: called before each batch.
-        batch_size, shuffle: as of `DataLoader`.
+        batch_size, shuffle, persistent: as of `DataLoader`.
     """
 
     def __init__(
-        self, count: int, item: Callable[[int], Any], begins: Callable[[], None], batch_size: int, shuffle: bool
+        self,
+        count: int,
+        item: Callable[[int], Any],
+        begins: Callable[[], None],
+        batch_size: int,
+        shuffle: bool,
+        persistent: bool,
     ) -> None:
-        self._order: DataLoader[int] = DataLoader(range(count), batch_size, shuffle)  # type: ignore[arg-type]
-        self._item, self._begins = item, begins
+        indices = range(count)
+        sampler: Sampler[int] = RandomSampler(indices) if shuffle else SequentialSampler(indices)
+        self._order = BatchSampler(sampler, batch_size, drop_last=False)
+        self._item, self._begins, self._persistent, self._seeded = item, begins, persistent, False
 
     def __len__(self) -> int:
         return len(self._order)
 
     def __iter__(self) -> Iterator[Any]:
+        if not (self._seeded and self._persistent):
+            torch.empty((), dtype=torch.int64).random_()  # a loader draws a seed for its workers
+            self._seeded = True
         for batch in self._order:
             self._begins()
-            yield default_collate([self._item(index) for index in batch.tolist()])
+            yield default_collate([self._item(index) for index in batch])
 
 
-def level_item(view: SplatView, level: int, images: LevelImages) -> dict[str, Any]:
-    """Return what a dataset would return of a view if its images had a level's size."""
+def level_item(view: SplatView, level: int, device: torch.device) -> dict[str, Any]:
+    """Return what a dataset would return of a view if its images had a level's size, without image and mask."""
     size = level_size(view.size, level)
     item = {**view.item, "K": level_intrinsics(view.item["K"], view.size, level)}
-    item[IMAGE] = images.targets.get(view.name).permute(1, 2, 0) * 255
-    if (weights := images.get_weights(view.name)) is not None and MASK in item:
-        item[MASK] = weights[0] > 1 - 0.5 / 255
+    item.pop(MASK, None)
     if POINTS in item:  # (m, 2) in pixels
-        item[POINTS] = item[POINTS] * item[POINTS].new_tensor(
-            [part / of for part, of in zip(size, view.size, strict=True)]
-        )
-    return item
+        factors = [part / of for part, of in zip(size, view.size, strict=True)]
+        item[POINTS] = item[POINTS] * item[POINTS].new_tensor(factors)
+    return {name: value.to(device) if isinstance(value, Tensor) else value for name, value in item.items()}
+
+
+def level_pixels(view: SplatView, images: LevelImages) -> dict[str, Tensor]:
+    """Return the image (h, w, 3) from 0 to 255 and the mask (h, w), if there is one, that a dataset would return."""
+    stored = images.targets.get_stored(view.name)  # (3, h, w)
+    image = stored.float() if stored.dtype == torch.uint8 else stored.float() * 255
+    weights = images.get_weights(view.name) if MASK in view.item else None
+    return {IMAGE: image.permute(1, 2, 0), **({} if weights is None else {MASK: weights[0] > 1 - 0.5 / 255})}
