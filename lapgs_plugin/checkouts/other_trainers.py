@@ -10,9 +10,12 @@ PREFIXES = {"ns-": "nerfstudio"}
 """Beginnings of commands of trainers by their package."""
 
 KNOWN = {
-    "nerfstudio": "nerfstudio's trainers have models of their own; `lapgs train DATA` trains the folder that they read",
-    "gsplat": "scripts around gsplat have loops of their own; `lapgs train SCENE` trains with gsplat without a "
-    "checkout, and `lapgs help python` shows how a loop of your own trains levels",
+    "nerfstudio": "nerfstudio's trainers make data, model and loop of a configuration, and splatfacto enlarges its "
+    "images itself (--pipeline.model.num-downscales, --pipeline.model.resolution-schedule); `lapgs train DATA` trains "
+    "the folder that they read, and `lapgs help python` shows how a loop of your own trains levels",
+    "gsplat": "of the scripts around gsplat, simple_trainer.py and those with its class are trained by `lapgs run "
+    "simple_trainer.py default ...`; `lapgs train SCENE` trains with gsplat without a checkout, and `lapgs help "
+    "python` shows how a loop of your own trains levels",
 }
 """What to do by the package that a script imports."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +23,12 @@ class SplatScript:
     Attributes:
         path: of the script.
         trainer: name of its class with `METHODS`.
+        packages: that it imports besides Python's own and those beside it, by name.
     """
 
     path: Path
     trainer: str
+    packages: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, path: Path) -> SplatScript | None:
@@ -35,13 +38,18 @@ class SplatScript:
             UserInputError: it is not Python.
         """
         tree = parsed(path)
-        imports = [node for node in executed_on_import(tree.body) if isinstance(node, ast.ImportFrom)]
+        statements = list(executed_on_import(tree.body, surely=True))
+        froms = [node for node in statements if isinstance(node, ast.ImportFrom) and node.module and not node.level]
+        plain = [each.name for node in statements if isinstance(node, ast.Import) for each in node.names]
+        modules = {name.partition(".")[0] for name in (*plain, *(str(node.module) for node in froms))}
+        beside = {each.stem for each in path.parent.iterdir()}
+        packages = tuple(sorted(modules - sys.stdlib_module_names - beside))
         rasterizes = any(
-            (node.module or "").partition(".")[0] == "gsplat" and RASTERIZATION in {each.name for each in node.names}
-            for node in imports
+            str(node.module).startswith("gsplat") and RASTERIZATION in {each.name for each in node.names}
+            for node in froms
         )
         trainers = [node for node in tree.body if isinstance(node, ast.ClassDef) and _trains(node)]
-        return cls(path, trainers[0].name) if rasterizes and trainers else None
+        return cls(path, trainers[0].name, packages) if rasterizes and trainers else None
 
 
 def _trains(node: ast.ClassDef) -> bool:

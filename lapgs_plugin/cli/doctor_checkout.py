@@ -14,6 +14,7 @@ from lapgs_plugin.checkouts.packages import COMPANIONS, OURS, README, missing_pa
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.source import CheckoutSource, readable_sources
+from lapgs_plugin.checkouts.splat_script import SplatScript
 from lapgs_plugin.environment import is_installed
 from lapgs_plugin.environment.findings import Finding
 from lapgs_plugin.errors import MissingExtraError, UserInputError
@@ -31,6 +32,8 @@ def describe(path: Path) -> dict[str, list[Finding]]:
     Raises:
         UserInputError: it is no 3DGS checkout; or it has several training scripts, none of them `train.py` in its root.
     """
+    if path.is_file() and (splats := SplatScript.read(path.absolute())) is not None:
+        return _of_splats(splats)
     source, others = _source(path)
     unused = f"none of the {len(source.modules)} modules that the script imports uses one"
     adapter = adapter_class(source.root)
@@ -47,6 +50,24 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         "Packages": _packages(source),
         "Schedule": _schedule(source),
         "lapgs run": [*_kinds_of_models(source), _rasterizer_on_gpu(source), _stand_in(source)],
+    }
+
+
+def _of_splats(script: SplatScript) -> dict[str, list[Finding]]:
+    """Return what `lapgs run` makes of a script whose class trains splats."""
+    absent = [name for name in script.packages if not is_installed(name)]
+    packages = [Finding(name, "absent", "not installed; its requirements.txt lists it") for name in absent]
+    return {
+        "Checkout": [
+            Finding("Script", "ok", str(script.path)),
+            Finding("Training", "ok", f"{script.trainer}.train() renders with gsplat's rasterization()"),
+        ],
+        "Packages": packages or [Finding("Imports", "ok", "all are installed")],
+        "lapgs run": [
+            Finding("nested", "ok", f"one call of {script.trainer}.train()"),
+            Finding("laplacian", "ok", "residuals get their colours as they are; no patch is needed"),
+            Finding("--device cpu", "ok", "stand-in of rasterization(), where its packages are installed"),
+        ],
     }
 
 
