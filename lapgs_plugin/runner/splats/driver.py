@@ -153,13 +153,18 @@ class SplatDriver:
             if dataset is self._run.trainer.valset:  # read once in a while: processes for it take longer to start
                 return original(dataset, batch_size=batch_size, shuffle=shuffle)
             persistent = bool(others.get("persistent_workers"))
-            return LevelBatches(len(dataset), self._item, self._iteration_begins, batch_size, shuffle, persistent)
+            acts = self._item, self._prefetch, self._iteration_begins
+            return LevelBatches(len(dataset), *acts, batch_size, shuffle, persistent)
 
         return load
 
     def _item(self, index: int) -> dict[str, Any]:
         assert self._stage is not None, "a stage draws views"
         return self._stage.item(index)
+
+    def _prefetch(self, index: int) -> None:
+        if self._stage is not None:
+            self._stage.prefetch(index)
 
     def _iteration_begins(self) -> None:
         assert self._stage is not None, "a stage iterates"

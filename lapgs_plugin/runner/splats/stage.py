@@ -70,7 +70,7 @@ class SplatStage:
         run, (width, height) = self._run, self.stage.image_size
         with self._record.overhead.timed("pyramid"):
             for view in run.train:
-                self._images.put(view.name, view.image, view.mask)
+                self._images.put(view.name, view.image(run.device), view.mask)
         if self._coarser is not None and self._joint_from != 1 and not self._moves_cameras:
             with self._record.overhead.timed("cache"):
                 self._predictions = self._predict_all(self._coarser)
@@ -88,6 +88,13 @@ class SplatStage:
         if index not in self._items:
             self._items[index] = level_item(view, self.stage.level, self._run.device)
         return {**self._items[index], **level_pixels(view, self._images)}
+
+    def prefetch(self, index: int) -> None:
+        """Start copying a training view's images to the device."""
+        name = self._run.train[index].name
+        self._images.prefetch(name)
+        if self._predictions is not None:
+            self._predictions.prefetch(name)
 
     def iteration_begins(self) -> None:
         """Act before an iteration of the script's loop."""
@@ -245,7 +252,7 @@ class SplatStage:
         """Return means of PSNR in dB and SSIM over the held-out views, upsampled."""
         device, level = self._run.device, self.stage.level
         return mean_quality(
-            (to_full_size(self._render(view).contiguous(), view.size, level, self._pyramid), view.image.to(device))
+            (to_full_size(self._render(view).contiguous(), view.size, level, self._pyramid), view.image(device))
             for view in self._run.test
         )
 

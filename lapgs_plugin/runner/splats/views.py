@@ -40,10 +40,9 @@ class SplatView:
         """Width and height."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    @property
-    def image(self) -> Tensor:
-        """The image (3, h, w) in [0, 1]."""
-        return self.pixels.permute(2, 0, 1) / 255
+    def image(self, device: torch.device) -> Tensor:
+        """Return the image (3, h, w) in [0, 1], which is copied to the device in 8 bits."""
+        return self.pixels.to(device).permute(2, 0, 1) / 255
 
     @property
     def mask(self) -> Tensor | None:
@@ -93,6 +92,7 @@ class LevelBatches:
     Args:
         count: number of views.
         item: returns a view's item at the running level, by index.
+        prefetch: called with the indices of the views of the batch that follows.
         begins: called before each batch.
         batch_size, shuffle, persistent: as of `DataLoader`.
     """
@@ -101,6 +101,7 @@ class LevelBatches:
         self,
         count: int,
         item: Callable[[int], Any],
+        prefetch: Callable[[int], None],
         begins: Callable[[], None],
         batch_size: int,
         shuffle: bool,
@@ -109,7 +110,8 @@ class LevelBatches:
         indices = range(count)
         sampler: Sampler[int] = RandomSampler(indices) if shuffle else SequentialSampler(indices)
         self._order = BatchSampler(sampler, batch_size, drop_last=False)
-        self._item, self._begins, self._persistent, self._seeded = item, begins, persistent, False
+        self._item, self._prefetch, self._begins = item, prefetch, begins
+        self._persistent, self._seeded = persistent, False
 
     def __len__(self) -> int:
         return len(self._order)
@@ -118,9 +120,14 @@ class LevelBatches:
         if not (self._seeded and self._persistent):
             torch.empty((), dtype=torch.int64).random_()  # a loader draws a seed for its workers
             self._seeded = True
-        for batch in self._order:
+        order = iter(self._order)
+        batch = next(order, None)
+        while batch is not None:
             self._begins()
-            yield default_collate([self._item(index) for index in batch])
+            items, batch = [self._item(index) for index in batch], next(order, None)
+            for index in batch or ():
+                self._prefetch(index)
+            yield default_collate(items)
 
 
 def level_item(view: SplatView, level: int, device: torch.device) -> dict[str, Any]:
