@@ -37,7 +37,10 @@ OF_OTHERS = {
     # of the extension in docs/extending.md
     "--duplicates",
     # of gsplat's trainer, pip and mkdocs
-    "--data_dir", "--data_factor", "--disable_video", "--max_steps", "--index-url", "--no-build-isolation",
+    "--app_opt", "--data_dir", "--data_factor", "--depth_loss", "--disable_video", "--max_steps", "--patch_size",
+    "--pose_opt", "--random_bkgd", "--result_dir", "--index-url", "--no-build-isolation",
+    # of nerfstudio, before a point
+    "--pipeline",
 }  # fmt: skip
 """Options in documents that are not of `lapgs`."""
 
@@ -63,6 +66,7 @@ def test_every_command_parses(document: Path, tmp_path: Path, monkeypatch: pytes
     Path("ms").mkdir()
     for script in ("train_dash.py", "ms/train.py"):  # of forks
         shutil.copy("train.py", script)
+    shutil.copy(ROOT / "tests/contract/checkouts/simple_trainer/simple_trainer.py", ".")
     config = Path("runs/garden/run.toml")  # a command with --config reads it when it is parsed
     config.parent.mkdir(parents=True)
     config.write_text('scene = "data/garden"\n')
