@@ -37,7 +37,7 @@ OF_OTHERS = {
     # of the extension in docs/extending.md
     "--duplicates",
     # of gsplat's trainer, pip and mkdocs
-    "--app_opt", "--data_dir", "--data_factor", "--depth_loss", "--disable_video", "--max_steps", "--patch_size",
+    "--app_opt", "--data_dir", "--data_factor", "--disable_video", "--max_steps", "--patch_size",
     "--pose_opt", "--random_bkgd", "--result_dir", "--index-url", "--no-build-isolation",
     # of nerfstudio, before a point
     "--pipeline",

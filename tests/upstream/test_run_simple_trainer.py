@@ -27,8 +27,8 @@ pytestmark = pytest.mark.upstream
 
 SITE = Path(__file__).parent / "simple_trainer_site"
 SCHEDULE = (
-    "--data_factor 1 --max_steps 120 --eval_steps 120 --save_steps 120 --disable_viewer --strategy.refine_start_iter 20 "
-    "--strategy.refine_every 20 --strategy.refine_stop_iter 90"
+    "--data_factor 1 --max_steps 120 --eval_steps 120 --save_steps 120 --disable_viewer --disable_video "
+    "--strategy.refine_start_iter 20 --strategy.refine_every 20 --strategy.refine_stop_iter 90"
 )
 CASES = [("nested", "default"), ("laplacian", "default"), ("laplacian", "mcmc"), ("laplacian", "default --pose_opt")]
 
