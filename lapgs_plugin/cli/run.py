@@ -167,6 +167,8 @@ def _execute_splats(
     path = described.path
     if options.record:
         raise UserInputError(f"--record: {path} records its time and quality itself, in stats/; leave it out")
+    if options.rasterizer == "lapgs":
+        raise UserInputError(f"--rasterizer lapgs: {path} renders with gsplat's; leave it out, or use `lapgs train`")
     on_device: AbstractContextManager[None] = splats_on_cpu() if device == "cpu" else nullcontext()
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(path, arguments) as loaded:

@@ -287,6 +287,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], str]] = {
     "inherit": (("--inherit", "full"), (), "--inherit full"),
     "masks": (("--masks", "masks"), (), "--masks masks"),
     "breakdown": (("--breakdown",), (), "--breakdown"),
+    "rasterizer": (("--rasterizer", "lapgs"), (), "--rasterizer lapgs"),
     "record": (("--off", "--record"), (), "--record"),
     "patches": ((), ("--patch_size", 16), "--patch_size 16"),
     "lens": ((), ("--camera_model", "fisheye"), "--camera_model fisheye"),
