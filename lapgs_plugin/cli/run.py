@@ -158,9 +158,10 @@ def _execute_splats(
     """Execute a script whose class trains splats: with a hierarchy, or unchanged with --off."""
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
+    from lapgs_plugin.environment import is_installed
     from lapgs_plugin.errors import MissingExtraError, first_line
     from lapgs_plugin.runner.splats.driver import SplatDriver, run_bare
-    from lapgs_plugin.runner.splats.on_cpu import splats_on_cpu
+    from lapgs_plugin.runner.splats.on_cpu import own_ssim, splats_on_cpu
     from lapgs_plugin.runner.splats.run import SplatRequest
     from lapgs_plugin.viewer.preview import save_run_preview
 
@@ -169,7 +170,11 @@ def _execute_splats(
         raise UserInputError(f"--record: {path} records its time and quality itself, in stats/; leave it out")
     if options.rasterizer == "lapgs":
         raise UserInputError(f"--rasterizer lapgs: {path} renders with gsplat's; leave it out, or use `lapgs train`")
-    on_device: AbstractContextManager[None] = splats_on_cpu() if device == "cpu" else nullcontext()
+    on_device: AbstractContextManager[None] = nullcontext()
+    if device == "cpu":
+        on_device = splats_on_cpu()
+    elif not is_installed("fused_ssim"):
+        on_device = own_ssim()
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(path, arguments) as loaded:
             if options.off:

@@ -75,14 +75,21 @@ def _with_pose_gradient(inputs: dict[str, Any]) -> dict[str, Any]:
 
 
 @contextmanager
-def splats_on_cpu() -> Iterator[None]:
-    """Let "cuda" mean the CPU inside, also in gsplat's strategies and in `fused_ssim`."""
+def own_ssim() -> Iterator[None]:
+    """Let imports of `fused_ssim`, which has to be compiled, find our module inside."""
     module = ModuleType("fused_ssim")
     module.__spec__ = ModuleSpec("fused_ssim", None)
     vars(module).update(fused_ssim=ssim.fused_ssim)
+    with replaced(sys.modules, {"fused_ssim": module}):
+        yield
+
+
+@contextmanager
+def splats_on_cpu() -> Iterator[None]:
+    """Let "cuda" mean the CPU inside, also in gsplat's strategies and in `fused_ssim`."""
     with ExitStack() as stack:
         stack.enter_context(cuda_on_cpu(None))
-        stack.enter_context(replaced(sys.modules, {"fused_ssim": module}))
+        stack.enter_context(own_ssim())
         with suppress(ImportError):  # the script says what it needs
             ops = import_module("gsplat.strategy.ops")
             own = {"compute_relocation": _relocation, "quat_scale_to_covar_preci": _covariances}
