@@ -30,7 +30,7 @@ from lapgs_plugin.runner.splats.schedule import THRESHOLD
 from lapgs_plugin.runner.splats.signed import Rasterizer
 from lapgs_plugin.runner.splats.views import SplatView, read_views
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import require_place, require_utf8
+from lapgs_plugin.runs.layout import require_place, require_room, require_utf8
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.trained_cameras import TrainedCameras
@@ -137,7 +137,7 @@ def prepare(request: SplatRequest, rasterizer: Rasterizer, trainer: Any, began: 
         )
     folder = Path(config.result_dir)
     if not request.resume:
-        RunArchive.require_room(folder, request.overwrite, began)
+        require_room(folder, request.overwrite, began)
         require_place(folder, RESULTS)
         require_utf8(folder, RESULTS)
     elif not settings.has_residuals:

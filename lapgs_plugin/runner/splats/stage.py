@@ -20,8 +20,6 @@ from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.ops.composition import to_full_size
-from lapgs_plugin.runner.iteration_parts import IterationParts
-from lapgs_plugin.runner.loop_record import StageRecord
 from lapgs_plugin.runner.splats.joint import follow, trainable
 from lapgs_plugin.runner.splats.run import SplatRun, write_cameras
 from lapgs_plugin.runner.splats.schedule import opacity_weight
@@ -30,8 +28,8 @@ from lapgs_plugin.runner.splats.views import SplatView, level_item, level_pixels
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
-from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
 
@@ -53,8 +51,13 @@ class SplatStage:
         self._predictions: UpsampledImages | None = None
         self._coarser = CoarserLevels(run.rasterizer, self._pyramid, finished) if finished else None
         self._joint, self._joint_from = False, run.settings.joint_from(stage)
-        parts = IterationParts(run.device, measures=False)
-        self._record = StageRecord(run.archive, run.window(stage), parts, run.request.measuring.gpu_busy)
+        self._record = StageRecord(
+            archive=run.archive,
+            stage=stage,
+            iterations=run.plan.iterations,
+            device=run.device,
+            profiled=stage.iterations if run.request.measuring.gpu_busy else 0,
+        )
         sizes = [view.size for view in run.train]
         folder = run.archive.path(CACHE)
         self._stores = ImageStores(sizes, run.device, eight_bit=True, where=run.settings.images_on, folder=folder)
@@ -79,6 +82,7 @@ class SplatStage:
             for optimizer in self._trainer.optimizers.values():
                 fuse_steps(optimizer)
         self._record.start()
+        self._record.rewind_history()
         run.request.watcher.stage_started(self.stage)
 
     def item(self, index: int) -> dict[str, Any]:
@@ -106,7 +110,8 @@ class SplatStage:
         if every is not None and self.iteration > 1 and (self.iteration - 1) % every == 0 and self._run.test:
             elapsed = self._record.elapsed_in_run()
             with self._record.outside("evaluation"):
-                self._record.write_quality(self.iteration - 1, self._held_out_quality(), elapsed)
+                quality = self._held_out_quality()
+            self._record.write_history(self.iteration - 1, {"elapsed": elapsed, **quality})
         if self.iteration == self._joint_from:
             self._train_jointly()
         if self.stage.signed and self._opacity_weight > 0:
@@ -115,7 +120,9 @@ class SplatStage:
         if self._joint and self._coarser is not None:
             count += sum(len(field.splats["means"]) for field in self._coarser.fields)
         self._record.count(self.iteration, count)
-        self._record.write_progress(count)
+        if self.iteration % self._record.history_every == 0:
+            figures = {"elapsed": self._record.elapsed_in_run(), "num_gaussians": count}
+            self._record.write_history(self.iteration, figures)
 
     def outside(self, purpose: str) -> Any:
         """Return a context whose seconds are no optimization."""
@@ -224,16 +231,15 @@ class SplatStage:
                 f"training diverged at level {self.stage.level}: {error}; start again with lower learning rates, or "
                 "see whether `lapgs run --off` diverges too"
             ) from error
-        self._record.archive(field, {}, joint)
+        archive.finish_level(self._record.of_level(len(field)), field, None, joint)
         if getattr(self._run.config, "pose_opt", False):
             write_cameras(self._run, self._refined_camera)
         if self._run.test and self.stage.level <= 1:
             with self._record.after_archive("evaluation"):
                 quality = self._held_out_quality()
-            self._record.write_quality(self.stage.iterations, quality)
+            self._record.write_history(self.stage.iterations, quality)
             logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._run.test))
-        psnr = last_psnr(archive.history()) if self.stage.level == 0 else {}
-        for line in weak_levels(archive.manifest.records[-1:], psnr):
+        for line in self._record.weak_lines():
             logger.warning("%s", line)
         self._run.request.watcher.stage_finished(self.stage, self._fields)
 
