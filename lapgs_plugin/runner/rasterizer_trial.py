@@ -32,6 +32,9 @@ LARGE_TOLERANCE, LARGE_SHARE = 0.05, 1e-4
 RADIUS_TOLERANCE, RADIUS_SHARE = 1, 1e-3
 """A radius agrees within a pixel, to which it is rounded up. All but this share of the Gaussians have to."""
 
+STRETCH = 0.5
+"""Standard deviation of the logarithms by which the axes of compared Gaussians are stretched."""
+
 GRADIENT_TOLERANCE = 0.02
 """Largest norm of the difference of an input's gradients, in norms of the gradient."""
 
@@ -88,7 +91,8 @@ class Rendered:
 
 def trials_of(calls: Iterable[RasterizerCall], device: torch.device) -> Iterator[Trial]:
     """Yield the measurements of calls, and of as many Gaussians as later in a run, until a difference is found."""
-    for call in calls:
+    for first in calls:
+        call = stretched(first)
         yield (trial := tried(call, device))
         later = repeated(call, LATER_COUNT)
         if not trial.difference and later is not None:
@@ -125,6 +129,25 @@ def rendered(rasterizer: Callable[..., Any], call: RasterizerCall, device: torch
     backward = statistics.median(clock.milliseconds(middle, end) for _, middle, end in times[WARM_UP:])
     gradients = {name: each for name, each in zip(wanted, found, strict=True) if each is not None}
     return Rendered(image.detach(), _radii(outputs, call.count), gradients, Times(forward, backward))
+
+
+def stretched(call: RasterizerCall) -> RasterizerCall:
+    """Return a call whose Gaussians have three different axes, turned at random.
+
+    A scene's first Gaussians are spheres: the gradient by their rotations is rounding alone, which differs.
+    """
+    scales, rotations = call.inputs.get("scales"), call.inputs.get("rotations")
+    if not isinstance(scales, Tensor) or not isinstance(rotations, Tensor):
+        return call
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randn(scales.shape, generator=generator).mul(STRETCH).exp().to(scales)
+    turned = torch.nn.functional.normalize(torch.randn(rotations.shape, generator=generator), dim=1).to(rotations)
+    inputs = {
+        **call.inputs,
+        "scales": (scales.detach() * factors).requires_grad_(scales.requires_grad),
+        "rotations": turned.requires_grad_(rotations.requires_grad),
+    }
+    return RasterizerCall(call.view, call.own, call.ours, inputs, call.settings)
 
 
 def repeated(call: RasterizerCall, count: int) -> RasterizerCall | None:

@@ -109,7 +109,7 @@ class RasterizerWrapper:
             for name in rasterizer.settings:
                 found += [(place, self.settings) for place in profile.places(rasterizer, name)]
             for name in rasterizer.entries:
-                kind = self._class if inspect.isclass(vars(rasterizer.module)[name]) else self._function
+                kind = self.wrap_class if inspect.isclass(vars(rasterizer.module)[name]) else self.wrap_function
                 make = partial(kind, ours=getattr(ours, name, None))
                 found += [(place, make) for place in profile.places(rasterizer, name)]
         return [Replacement(*place, make, consumer) for place, make in found]
@@ -138,7 +138,9 @@ class RasterizerWrapper:
 
         return make_settings
 
-    def _class(self, original: Callable[..., Any], ours: Callable[..., Any] | None) -> Callable[..., Any]:
+    def wrap_class(self, original: Callable[..., Any], ours: Callable[..., Any] | None = None) -> Callable[..., Any]:
+        """Return the replacement of the constructor of a rasterizer, and of ours in its place."""
+
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
             made = (ours if ours is not None and self.takes_ours else original)(*args, **kwargs)
             if self._stages.rendering is None:
@@ -147,7 +149,9 @@ class RasterizerWrapper:
 
         return make_rasterizer
 
-    def _function(self, original: Callable[..., Any], ours: Callable[..., Any] | None) -> Callable[..., Any]:
+    def wrap_function(self, original: Callable[..., Any], ours: Callable[..., Any] | None = None) -> Callable[..., Any]:
+        """Return the replacement of a rasterizer that is a function, and of ours in its place."""
+
         @wraps(original)
         def rasterize(*args: Any, **kwargs: Any) -> Any:
             chosen = ours if ours is not None and self.takes_ours else original

@@ -80,6 +80,6 @@ def test_paragraphs_fill_the_lines_of_a_terminal_and_examples_take_one_each(word
 def test_options_that_train_and_run_share_come_in_the_same_order() -> None:
     commands = all_commands()
     train, run = ([option.name for option in commands.commands[name].params] for name in ("train", "run"))
-    shared = [name for name in train if name in run]
+    shared = [name for name in train if name in run and name != "rasterizer"]  # which asks each command something else
     assert "resume" in shared
-    assert [name for name in run if name in train] == shared
+    assert [name for name in run if name in shared] == shared

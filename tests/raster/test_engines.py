@@ -45,7 +45,7 @@ INPUTS = {
 
 
 def on(device, value):
-    return value.to(device) if isinstance(value, Tensor) else value
+    return value.detach().clone().to(device) if isinstance(value, Tensor) else value
 
 
 def prepared(variant, device, **changes):
@@ -59,7 +59,7 @@ def prepared(variant, device, **changes):
         values |= {"dc": sh[:, :1], "shs": sh[:, 1:]}
     if variant == "2dgs":
         values["scales"] = values["scales"][:, :2].contiguous()
-    leaves = {name: on(device, value.detach().clone()).requires_grad_() for name, value in values.items()}
+    leaves = {name: on(device, value).requires_grad_() for name, value in values.items()}
     others = {name: on(device, value) for name, value in INPUTS.get(variant, {}).items()}
     if "scores" in others:
         others["scores"].requires_grad_()
@@ -133,7 +133,7 @@ def raw(device):
         proper_antialiasing=True,
     )
     parts = field.means, field.log_scales, field.quaternions, field.opacity_logits[:, None], *field.sh.split([1, 8], 1)
-    leaves = [on(device, part.detach().clone()).requires_grad_() for part in parts]
+    leaves = [on(device, part).requires_grad_() for part in parts]
     image = module.diff_rasterize(*leaves, info, settings)
     (image * on(device, BY[:3])).sum().backward()
     return {"image": image, "info": info} | {f"leaf {i}": leaf.grad for i, leaf in enumerate(leaves)}

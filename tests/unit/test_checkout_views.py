@@ -122,7 +122,7 @@ def residual(camera: Camera, key: str, below: Tensor) -> tuple[Stages, Rasterize
     stages = Stages()
     stages.rendering = rendering
     wrapper = RasterizerWrapper(stages)
-    return stages, wrapper, wrapper.settings(Settings), wrapper._function(rasterize)
+    return stages, wrapper, wrapper.settings(Settings), wrapper.wrap_function(rasterize)
 
 
 def colored(means: Tensor, colors: Tensor, rasterizer_settings: Settings) -> tuple[Tensor, Tensor]:
@@ -139,7 +139,7 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
     rendering: Any = stages.rendering
     rendering.signed = signed
     rendering.on_image = lambda key, image, below: image + 1
-    function = wrapper._function(colored)
+    function = wrapper.wrap_function(colored)
     view = make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4))
     means, own = torch.zeros(2, 3, requires_grad=True), torch.full((2, 3), 0.125)
 
@@ -179,7 +179,7 @@ def test_maps_beside_a_residuals_image_are_not_trained_on(signed: bool) -> None:
         found = {"radii": (3,), "image": (3, *size), "depth": size, "normals": (*size, 3), "features": (16, *size)}
         return {name: means.mean().expand(shape) * 1 for name, shape in found.items()}
 
-    function = wrapper._function(forward)
+    function = wrapper.wrap_function(forward)
 
     @wrapper.renderer
     def render(viewpoint: Any) -> dict[str, Tensor]:
@@ -212,7 +212,7 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
         values = shs.mean((0, 1)) if colors_precomp is None else colors_precomp.mean(0)  # type: ignore[union-attr]
         return torch.zeros(1), means.mean() + values.expand(size)
 
-    function = wrapper._function(forward)
+    function = wrapper.wrap_function(forward)
 
     @wrapper.renderer
     def render(viewpoint: Any) -> dict[str, Tensor]:
@@ -333,7 +333,7 @@ def test_a_render_of_another_size_is_said() -> None:
 def test_outputs_without_an_image_are_named() -> None:
     camera, images = made()
     _, wrapper, settings, _ = residual(camera, images.key(camera), torch.zeros(3, 3, 4))
-    broken = wrapper._function(lambda rasterizer_settings: (torch.zeros(2, 3, 4), torch.zeros(2)))
+    broken = wrapper.wrap_function(lambda rasterizer_settings: (torch.zeros(2, 3, 4), torch.zeros(2)))
     with pytest.raises(UserInputError, match=r"returns \(2, 3, 4\), \(2,\), expected an image \(3, h, w\) of 4x3"):
         broken(rasterizer_settings=settings(3, 4, torch.ones(3), torch.eye(4)))
 
@@ -348,7 +348,7 @@ def test_an_image_is_the_first_three_of_more_channels(leading: tuple[int, ...]) 
         rows = torch.arange(5.0).reshape(*leading, 5, 1, 1) + means.mean()
         return rows.expand(*leading, 5, 3, 4), torch.zeros(2)
 
-    means, function = torch.zeros(2, 3, requires_grad=True), wrapper._function(forward)
+    means, function = torch.zeros(2, 3, requires_grad=True), wrapper.wrap_function(forward)
     render = wrapper.renderer(lambda view: function(means, settings(3, 4, torch.ones(3), torch.eye(4)))[0])
     found = render(camera)
     assert found.shape == (*leading, 5, 3, 4)

@@ -107,7 +107,12 @@ def regularized() -> Pair:
     [
         ("position_noise", ("add_noise_triton",), moved, "noise of positions in several operations"),
         ("regularization", ("add_regularization_triton",), regularized, "regularization in several operations"),
-        ("photometric_loss", ("photometric_loss_triton",), loss, "the photometric loss in many operations"),
+        (
+            "photometric_loss",
+            ("photometric_loss_triton", "ssim_map_triton"),
+            loss,
+            "the photometric loss in many operations",
+        ),
         ("densification_statistics", ("add_statistics_triton",), statistics, "densification statistics in several"),
         ("color_transform", ("transform_colors_triton",), colors, "colour transforms as products of matrices"),
         ("upsample", ("upsample_add_triton", "upsample_triton"), upsampled, "upsampling in many small operations"),

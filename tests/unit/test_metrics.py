@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from lapgs_plugin.cli.evaluate import _print_views
+from lapgs_plugin.cli.evaluate import print_views
 from lapgs_plugin.evaluation.metrics import far_worse_below, mean_quality, psnr, ssim
 
 
@@ -64,7 +64,7 @@ def test_views_that_are_far_worse_than_the_rest(psnrs: list[float], far: list[in
 def test_a_view_that_is_far_worse_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     names, figures = [f"view {index}[b]\x1b.png" for index in range(3)], {"fitted_psnr": 20.0, "ssim": 0.5}
     views = [{"name": name, "psnr": value, **figures} for name, value in zip(names, (22.1, 11.0, 23.0), strict=True)]
-    _print_views(Console(width=100), {"views": views, "lpips_missing": {}})
+    print_views(Console(width=100), {"views": views, "lpips_missing": {}})
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "far worse than the rest" in line]
     assert "1 of 3 views are far worse than the rest" in line
     assert [rf"view {index}[b]\x1b.png" in line for index in range(3)] == [False, True, False]

@@ -15,7 +15,7 @@ from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.family.variants import rasterizer_module
 from lapgs_plugin.runner.rasterizer_choice import CHOICE, GAIN, Times, Trial, decide, decided_without_trials
 from lapgs_plugin.runner.rasterizer_trial import RasterizerCall as Call
-from lapgs_plugin.runner.rasterizer_trial import Rendered, difference, rendered, repeated
+from lapgs_plugin.runner.rasterizer_trial import Rendered, difference, rendered, repeated, stretched
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 
 BOTH = CompiledModules(OWN, beside={"diff_raster": ModuleType("diff_raster")})
@@ -169,6 +169,14 @@ def test_a_rasterizer_is_rendered_with_the_gradients_of_all_its_inputs(device: s
     assert all(value.grad is None for value in of.inputs.values()), "the checkout's tensors stay as they are"
     assert found.times.forward > 0
     assert found.times.backward > 0
+
+
+def test_compared_gaussians_have_gradients_by_their_rotations() -> None:
+    spheres = call(torch.device("cpu"))
+    before, after = (rendered(of.own, of, torch.device("cpu")) for of in (spheres, stretched(spheres)))
+    assert before.gradients["rotations"].norm() < 1e-6 * before.gradients["scales"].norm()
+    assert after.gradients["rotations"].norm() > 1e-2 * after.gradients["scales"].norm()
+    assert bool((spheres.inputs["scales"] == 0.2).all()), "the checkout's tensors stay as they are"
 
 
 def test_later_in_a_run_there_are_more_and_smaller_gaussians() -> None:
