@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
+import gsplat
 import pytest
 import torch
 from gsplat.cuda import _torch_impl, _wrapper
@@ -215,6 +216,42 @@ def gsplat_on_cpu() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_wrapper, "_make_lazy_cuda_func", _checked)
         patch.setattr(_wrapper, "_make_lazy_cuda_obj", lambda name: name)
+        yield
+
+
+def _harmonics_160(degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor) -> Tensor:
+    """As gsplat's `spherical_harmonics` from 1.6.0 on: (c, n, 3) of means, seen by c poses."""
+    centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]  # (c, 3)
+    each = [_torch_impl._spherical_harmonics(degrees_to_use, means - centre, coeffs) for centre in centres]
+    return torch.stack(each)
+
+
+def _isect_tiles_160(
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
+    conics: Tensor | None = None, opacities: Tensor | None = None, **options: Any,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """As gsplat's `isect_tiles` from 1.6.0 on: without tiles in which no pixel has alpha of at least 1/255."""
+    counts, keys, order = _wrapper.isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, **options)
+    assert conics is not None
+    assert opacities is not None
+    within, tiles, ids = torch.arange(tile_size) + 0.5, keys % (tile_width * tile_height), order.long()
+    corners = torch.stack([tiles % tile_width, tiles // tile_width], -1) * tile_size  # (p, 2)
+    pixels = torch.stack(torch.meshgrid(within, within, indexing="xy"), -1)  # (t, t, 2)
+    dx, dy = (means2d[ids, None, None] - corners[:, None, None] - pixels).unbind(-1)  # (p, t, t)
+    xx, xy, yy = conics[ids, :, None, None].unbind(1)
+    alphas = opacities[ids, None, None] * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+    kept = (alphas >= FAINTEST).flatten(1).any(1)
+    assert bool(kept.any())
+    assert not bool(kept.all()), "nothing is left out here: the test shows nothing"
+    return torch.bincount(ids[kept], minlength=len(counts)), keys[kept], order[kept]
+
+
+@contextmanager
+def gsplat_160_on_cpu() -> Iterator[None]:
+    """Let gsplat find these kernels, by the functions of 1.6.0 that have other signatures."""
+    with gsplat_on_cpu(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gsplat, "spherical_harmonics", _harmonics_160)
+        patch.setattr(gsplat, "isect_tiles", _isect_tiles_160)
         yield
 
 

@@ -24,7 +24,7 @@ from lapgs_plugin.reference_raster.oracle import OracleRasterizer
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.speed import measure_speed
-from tests.gsplat_on_cpu import direct_on_cpu, gsplat_on_cpu
+from tests.gsplat_on_cpu import direct_on_cpu, gsplat_160_on_cpu, gsplat_on_cpu
 from tests.training_scene import blob_field, ring_camera
 
 CPU = torch.device("cpu")
@@ -200,14 +200,20 @@ def test_which_rasterizers_can() -> None:
         assert there.can_stack is expected
 
 
-def test_from_1_6_0_on_it_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    def harmonics(degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor) -> Tensor:
-        raise AssertionError
-
-    monkeypatch.setattr(gsplat, "spherical_harmonics", harmonics)
-    rasterizer = GsplatRasterizer("cpu")
-    rasterizer._device = torch.device("cuda")
-    assert not rasterizer.can_stack
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_it_renders_by_the_functions_of_1_6_0_as_well(antialiasing: bool) -> None:
+    fields = list(hierarchy((300, 100)).values())
+    cameras = [level_camera(CAMERA, 1), CAMERA]
+    background = torch.tensor(BACKGROUND)
+    expected = GsplatStack(fields, CPU, antialiased=antialiasing).render(cameras, background)
+    with gsplat_160_on_cpu():
+        rasterizer = GsplatRasterizer("cpu", antialiasing=antialiasing)
+        images = rasterizer.stack(fields).render(cameras, background)
+        rasterizer._device = torch.device("cuda")  # as if there were a GPU
+        assert rasterizer.can_stack
+    for image, other in zip(images, expected, strict=True):
+        assert other.abs().max() > 0.1
+        torch.testing.assert_close(image, other, rtol=0, atol=1e-5)  # worst seen: 0
 
 
 def test_antialiasing_dims_by_the_area_that_was_added() -> None:

@@ -334,9 +334,33 @@ class WithoutCuda:
         return {"radii": radii, "means2d": packed, "conics": conics, "gaussian_ids": ids}
 
 
-@pytest.fixture
-def without_cuda(monkeypatch: pytest.MonkeyPatch) -> WithoutCuda:
-    code = WithoutCuda()
+class AsOf160(WithoutCuda):
+    """The same with the signatures of gsplat 1.6.0, which has a tensor for absolute gradients from the start."""
+
+    def spherical_harmonics(  # type: ignore[override]  # that is the point
+        self, degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor, masks: Tensor | None = None
+    ) -> Tensor:
+        positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]  # (c, 3)
+        return torch.stack(
+            [super(AsOf160, self).spherical_harmonics(degrees_to_use, means - p, coeffs) for p in positions]
+        )
+
+    def rasterization(self, *args: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        image, alpha, info = super().rasterization(*args, **{**options, "absgrad": False})
+        self.asked["absgrad"], centres = options["absgrad"], info["means2d"]
+        if options["absgrad"]:
+            centres.absgrad = torch.zeros_like(centres)
+
+            def fill(gradient: Tensor) -> None:
+                centres.absgrad.copy_(gradient.abs())
+
+            centres.register_hook(fill)  # before that of the adapter
+        return image, alpha, info
+
+
+@pytest.fixture(params=[WithoutCuda, AsOf160], ids=["1.5.3", "1.6.0"])
+def without_cuda(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> WithoutCuda:
+    code: WithoutCuda = request.param()
     monkeypatch.setattr(gsplat, "rasterization", code.rasterization)
     monkeypatch.setattr(gsplat, "spherical_harmonics", code.spherical_harmonics)
     return code

@@ -34,7 +34,7 @@ from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.rasterizers.gsplat.stack import GsplatStack
-from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated, takes_viewmats
+from lapgs_plugin.rasterizers.gsplat.stock import StockRasterization, is_differentiated
 
 NAME = "gsplat"
 MOST_NUMBERS = 2**31 - 1
@@ -186,14 +186,8 @@ class GsplatRasterizer(Rasterizer):
 
     @property
     def can_stack(self) -> bool:
-        """See `fields.rasterizer.Rasterizer`. The stack calls our kernels, or functions of gsplat 1.5."""
-        if self._device.type != "cuda" or self._stock.packed:
-            return False
-        if self._may_be_direct and gsplat_missing():
-            return True
-        from gsplat import spherical_harmonics
-
-        return not takes_viewmats(spherical_harmonics)
+        """See `fields.rasterizer.Rasterizer`. The stack calls our kernels or functions of gsplat."""
+        return self._device.type == "cuda" and not self._stock.packed
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""

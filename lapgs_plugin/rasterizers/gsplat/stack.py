@@ -8,11 +8,12 @@ Only projection takes a launch for each field. gsplat culls and limits the Jacob
 field projected for the canvas of a finer one would differ near its border and be blended outside its image as well.
 Hence this is not `gsplat.rasterization` with one more dimension.
 
-Tested with gsplat 1.5.3, whose `rasterization` consists of the same five functions.
+Tested with gsplat 1.5.3, whose `rasterization` consists of the same five functions, and with the signatures of 1.6.0.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Sequence
 from itertools import accumulate
@@ -25,6 +26,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import FieldStack
 from lapgs_plugin.gpu_raster.cameras import cameras_on_device
 from lapgs_plugin.gpu_raster.records import TILE
+from lapgs_plugin.rasterizers.gsplat.stock import raw_sh_values
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
@@ -59,7 +61,7 @@ class GsplatStack(FieldStack):
             images, alphas = (self._means.new_zeros(len(cameras), height, width, planes) for planes in (3, 1))
         else:
             projected = self._project(cameras, viewmats, intrinsics)
-            images, alphas = self._blend(projected, self._colors(positions), len(cameras), (height, width))
+            images, alphas = self._blend(projected, self._colors(viewmats, positions), len(cameras), (height, width))
         rendered = []
         for i, camera in enumerate(cameras):
             image = images[i, : camera.height, : camera.width]  # (h, w, 3)
@@ -99,13 +101,11 @@ class GsplatStack(FieldStack):
         opacities = self._opacities[: self._starts[len(cameras)]]
         return [*joined[:4], opacities * joined[4] if self._antialiased else opacities]
 
-    def _colors(self, positions: Tensor) -> Tensor:
-        """Return colours (n, 3) of the first f fields, seen from `positions` (f, 3), which are all the same."""
-        from gsplat import spherical_harmonics
-
+    def _colors(self, viewmats: Tensor, positions: Tensor) -> Tensor:
+        """Return colours (n, 3) of the first f fields, from poses (f, 4, 4) with the same centres (f, 3)."""
         count = self._starts[len(positions)]
         degree = math.isqrt(self._sh.shape[1]) - 1
-        colors: Tensor = spherical_harmonics(degree, self._means[:count] - positions[0], self._sh[:count])
+        colors = raw_sh_values(degree, self._means[:count], self._sh[:count], viewmats[:1], positions[:1])[0]
         for i in range(len(positions)):
             if not self._signed[i]:
                 colors[self._rows(i)].add_(0.5).clamp_min_(0.0)
@@ -121,10 +121,13 @@ class GsplatStack(FieldStack):
         height, width = size
         columns, rows = -(-width // TILE), -(-height // TILE)
         of_image = self._images[: len(depths)]
+        # From 1.6.0 on: leave out tiles that the ellipse alpha = 1/255 does not meet. The image is the same.
+        known = inspect.signature(isect_tiles).parameters
+        ellipses = {"conics": conics, "opacities": opacities} if "conics" in known else {}
         # gsplat also takes the index of each Gaussian, but does not use it.
         _, keys, order = isect_tiles(
             means2d, radii, depths, TILE, columns, rows,
-            packed=True, n_images=count, image_ids=of_image, gaussian_ids=of_image,
+            packed=True, n_images=count, image_ids=of_image, gaussian_ids=of_image, **ellipses,
         )  # fmt: skip
         offsets = isect_offset_encode(keys, count, columns, rows)  # (f, rows, columns)
         # Without backgrounds: for a packed list gsplat 1.5.3 takes one background, not one per image.

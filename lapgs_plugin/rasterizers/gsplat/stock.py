@@ -67,7 +67,9 @@ class StockRasterization:
 
         means = field.means
         viewmats, intrinsics, positions = cameras_on_device(cameras, means)
-        colors = _raw_colors(field, degree, viewmats, positions)
+        colors = raw_sh_values(degree, means, field.sh, viewmats, positions)  # (b, n, 3)
+        if len(cameras) == 1:
+            colors = colors[0]
         if not field.signed:
             colors = torch.clamp_min(colors + 0.5, 0.0)
         result: tuple[Tensor, Tensor, dict[str, Any]] = rasterization(
@@ -133,15 +135,22 @@ def _channels_first(images: Tensor) -> Tensor:
     return images.permute(0, 3, 1, 2)
 
 
-def _raw_colors(field: GaussianField, degree: int, viewmats: Tensor, positions: Tensor) -> Tensor:
-    """Return raw SH values from each camera, (n, 3) for one and (b, n, 3) for several."""
+def raw_sh_values(degree: int, means: Tensor, sh: Tensor, viewmats: Tensor, positions: Tensor) -> Tensor:
+    """Return raw SH values (b, n, 3) by gsplat's `spherical_harmonics`, whichever of its signatures it has.
+
+    Args:
+        degree: highest to evaluate.
+        means: (n, 3).
+        sh: (n, k, 3).
+        viewmats, positions: (b, 4, 4) poses of the cameras, and (b, 3) their centres.
+    """
     from gsplat import spherical_harmonics
 
     if takes_viewmats(spherical_harmonics):
-        values: Tensor = spherical_harmonics(degree, field.means, viewmats, field.sh)  # (b, n, 3)
+        values: Tensor = spherical_harmonics(degree, means, viewmats, sh)
         return values
-    each = [spherical_harmonics(degree, field.means - position, field.sh) for position in positions]  # (n, 3)
-    return each[0] if len(each) == 1 else torch.stack(each)
+    each = [spherical_harmonics(degree, means - position, sh) for position in positions]  # (n, 3)
+    return each[0][None] if len(each) == 1 else torch.stack(each)
 
 
 def _hand_over_gradients(info: dict[str, Any], means2d: Tensor, absgrad2d: Tensor | None) -> None:
