@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import math
 from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
@@ -23,7 +22,7 @@ from lapgs_plugin.errors import MissingExtraError, UserInputError, first_line
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult, Semantics
-from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
+from lapgs_plugin.rasterizers.empty_images import COMPANION_OPACITY, companion, projected_centres, surely_blends
 
 CONSTANTS: dict[str, Any] = {
     "scale_modifier": 1.0,
@@ -56,15 +55,6 @@ NEAR, FAR = 0.01, 100.0
 """Clipping planes of the projection matrix; the kernels only use its other rows."""
 SH_REST_COUNT = 15
 """Coefficients above the first at degree 3."""
-SAMPLED = 65536
-"""Approximate number of Gaussians in which `_surely_blends` searches."""
-MARGIN = 0.01
-"""Least distance in pixels of a centre from the image border, for `_surely_blends`."""
-LARGEST_DEVIATION = 100.0
-"""Largest standard deviation in pixels on the optical axis, for `_surely_blends`."""
-VISIBLE_LOGIT = math.log(2.4 / (255 - 2.4))
-"""Logit of an opacity above exp(5/6) / 255 and below the 0.01 to which training resets opacities."""
-COMPANION_OPACITY = 1.05 / 255
 POINT_DIMMING = 0.005
 """Factor of antialiasing on the opacity of a Gaussian without extent."""
 
@@ -141,7 +131,7 @@ class CudaExtension:
         means2d = field.means.new_zeros(n, 2).requires_grad_(torch.is_grad_enabled())  # (n, 2)
         image, radii = self._rasterize(field, camera, background, sh_degree, colors, means2d, absgrad2d)
         with torch.no_grad():
-            means2d.copy_(_centres(field, camera) * (radii > 0)[:, None])
+            means2d.copy_(projected_centres(field, camera) * (radii > 0)[:, None])
         return RenderResult(image, None, radii, means2d, absgrad2d)
 
     def _rasterize(
@@ -170,7 +160,7 @@ class CudaExtension:
         # tile's Gaussians in buckets of 32: with none in any tile they write out of bounds, or launch an empty grid in
         # the backward pass.
         antialiasing = "antialiasing" in self._settings and bool(self._constants["antialiasing"])
-        if n == 0 or (self._takes_dc and (antialiasing or not _surely_blends(field, camera))):
+        if n == 0 or (self._takes_dc and (antialiasing or not surely_blends(field, camera))):
             inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
         rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
         others = {name: make(inputs["means3D"]) for name, make in self._others.items()}
@@ -271,42 +261,12 @@ def _known_settings(module: ModuleType) -> tuple[str, ...]:
     return names
 
 
-def _surely_blends(field: GaussianField, camera: Camera) -> bool:
-    """Return whether some Gaussian is certainly in a tile, whatever kernels round. False may mean that none was found.
-
-    A tile includes a Gaussian whose alpha reaches 1/255 between the tile's first and last pixels. A centre in the image
-    is at most half a pixel in each direction from such a position, where alpha is, with a variance of 0.3 px^2 or more,
-    at least exp(-5/6) of the opacity.
-    """
-    with torch.no_grad():
-        step = len(field) // SAMPLED + 1
-        field = field.with_parameters({name: value[::step] for name, value in field.parameters.items()})
-        pose = camera.world_to_camera.to(field.means)
-        depths = field.means @ pose[2, :3] + pose[2, 3]  # (m,)
-        centres = _centres(field, camera)  # (m, 2)
-        last = centres.new_tensor([camera.width - 1, camera.height - 1])  # (2,)
-        inside = ((centres >= MARGIN) & (centres <= last - MARGIN)).all(1)  # (m,)
-        # The determinant of a large footprint's covariance could round to 0, which culls.
-        moderate = torch.exp(field.log_scales.amax(1)) * max(camera.fx, camera.fy) < LARGEST_DEVIATION * depths  # (m,)
-        visible = field.opacity_logits > VISIBLE_LOGIT  # (m,)
-        return bool((inside & moderate & visible & (depths > 2 * NEAR_DEPTH)).any())
-
-
 def _with_companion(inputs: dict[str, Tensor], camera: Camera, opacity: float) -> dict[str, Tensor]:
-    """Append a Gaussian that is in a tile but changes no pixel.
-
-    It is a point between the first four pixels, where its alpha is just over 1/255. At the pixels, which it reaches by
-    the 0.3 px^2 that are added to its variance, it is less than half of that.
-    """
+    """Append a Gaussian that is in a tile but changes no pixel."""
     rows = {name: value.new_zeros(1, *value.shape[1:]) for name, value in inputs.items()}
-    pose = camera.world_to_camera.to("cpu", torch.float64)
-    # Far enough for float32, whose rounding of the centre grows with the camera's distance from the origin.
-    depth = 1 + float(pose[:3, 3].norm())
-    point = torch.tensor([(1 - camera.cx) / camera.fx, (1 - camera.cy) / camera.fy, 1.0], dtype=torch.float64) * depth
-    rows["means3D"] = ((point - pose[:3, 3]) @ pose[:3, :3])[None].to(rows["means3D"])  # (1, 3)
-    rows["scales"] += 1e-4 * depth / max(camera.fx, camera.fy)
-    rows["rotations"][:, 0] = 1
-    rows["opacities"] += opacity
+    added = companion(camera, inputs["means3D"].detach(), opacity)
+    rows |= {"means3D": added.means, "scales": added.log_scales.exp(), "rotations": added.quaternions}
+    rows["opacities"] = added.opacity_logits.sigmoid()[:, None]
     return {name: torch.cat([value, rows[name]]) for name, value in inputs.items()}
 
 
@@ -326,10 +286,3 @@ def _matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
     return tuple(  # type: ignore[return-value]  # a tuple of two, which mypy cannot count
         matrix.T.contiguous().to(device, torch.float32) for matrix in (world_to_camera, clip @ world_to_camera)
     )
-
-
-def _centres(field: GaussianField, camera: Camera) -> Tensor:
-    """Return projected centres in pixels, (n, 2); meaningless behind the camera."""
-    x, y, depth = camera.local(field.means).unbind(-1)  # (n,) each
-    centres = torch.stack([camera.fx * x / depth + camera.cx - 0.5, camera.fy * y / depth + camera.cy - 0.5], dim=-1)
-    return centres.nan_to_num(0, 0, 0)  # NaN of a depth of 0 would survive the multiplication by 0 that culls it
