@@ -20,6 +20,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.memory_kernels import at_most
 from lapgs_plugin.gpu_raster.records import GRADIENT, RECORD, TILE
 from lapgs_plugin.gpu_raster.rules import GSPLAT, Rules
 from lapgs_plugin.gpu_raster.walk_kernels import (
@@ -301,7 +302,7 @@ def _blend(
         records, background, offsets, flat, words, images, inverse_depths, counts,
         flat.new_empty(programs, QUEUE.value),
         *numbers, 3 if background.ndim == 2 else 0, rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
-        family=rules.family, depth=rules.depth, num_warps=1, maxnreg=FORWARD_REGISTERS,
+        family=rules.family, depth=rules.depth, num_warps=1, **at_most(FORWARD_REGISTERS),
     )  # fmt: skip
     return counts, words
 
@@ -337,7 +338,7 @@ def blend_backward(
         flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         absolute=absolute, family=rules.family, depth=rules.depth, stride=stride, num_warps=1,
-        maxnreg=BACKWARD_REGISTERS,
+        **at_most(BACKWARD_REGISTERS),
     )  # fmt: skip
     leading = records.shape[:-1]
     return found.view(*leading, GRADIENT), others.view(*leading, stride)

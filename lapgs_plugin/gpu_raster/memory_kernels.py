@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import os
 
+import torch
 import triton
 import triton.language as tl
 
-INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET") == "1")  # Triton's interpreter knows no assembly
+INTERPRETED, OTHER_MAKER = os.environ.get("TRITON_INTERPRET") == "1", torch.version.hip is not None
+PLAIN = tl.constexpr(INTERPRETED or OTHER_MAKER)
+"""Do without NVIDIA's assembly, which neither Triton's interpreter nor AMD's GPUs know."""
+
+
+def at_most(registers: int) -> dict[str, int]:
+    """Return the option of a launch that limits a thread's registers; AMD's compiler knows none."""
+    return {} if OTHER_MAKER else {"maxnreg": registers}
 
 
 @triton.jit
 def load_four(start: tl.tensor) -> tl.tensor:
-    """Load four numbers that begin at a multiple of 16 bytes; where compiled, in one instruction."""
-    if INTERPRETED:
+    """Load four numbers that begin at a multiple of 16 bytes; on NVIDIA's, in one instruction."""
+    if PLAIN:
         return tl.load(start), tl.load(start + 1), tl.load(start + 2), tl.load(start + 3)
     return tl.inline_asm_elementwise(
         "ld.global.nc.v4.f32 {$0, $1, $2, $3}, [$4];", "=f,=f,=f,=f,l", [start],
@@ -23,8 +31,8 @@ def load_four(start: tl.tensor) -> tl.tensor:
 
 @triton.jit
 def store_four(start: tl.tensor, a: tl.tensor, b: tl.tensor, c: tl.tensor, d: tl.tensor, wanted: tl.tensor) -> None:
-    """Store four numbers from a multiple of 16 bytes on where wanted; where compiled, in one instruction."""
-    if INTERPRETED:
+    """Store four numbers from a multiple of 16 bytes on where wanted; on NVIDIA's, in one instruction."""
+    if PLAIN:
         tl.store(start, a, wanted)
         tl.store(start + 1, b, wanted)
         tl.store(start + 2, c, wanted)

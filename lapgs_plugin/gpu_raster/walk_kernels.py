@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from lapgs_plugin.gpu_raster.memory_kernels import INTERPRETED, load_four
+from lapgs_plugin.gpu_raster.memory_kernels import PLAIN, load_four
 from lapgs_plugin.gpu_raster.records import TILE, grid_of
 from lapgs_plugin.reference_raster.layout import MAX_ALPHA
 
@@ -62,8 +62,8 @@ def _multiply(a: tl.tensor, b: tl.tensor) -> tl.tensor:
 
 @triton.jit
 def _exp2(x: tl.tensor) -> tl.tensor:
-    """Return 2 ** x; where compiled, in one instruction instead of four, with 0 for denormal results."""
-    if INTERPRETED:
+    """Return 2 ** x; on NVIDIA's, in one instruction instead of four, with 0 for denormal results."""
+    if PLAIN:
         return tl.exp2(x)
     return tl.inline_asm_elementwise("ex2.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
 
@@ -71,7 +71,7 @@ def _exp2(x: tl.tensor) -> tl.tensor:
 @triton.jit
 def inverse_of(x: tl.tensor) -> tl.tensor:
     """Return 1 / x of numbers that are neither denormal nor huge, to one unit in the last place."""
-    if INTERPRETED:
+    if PLAIN:
         return 1.0 / x
     return tl.inline_asm_elementwise("rcp.approx.ftz.f32 $0, $1;", "=f,f", [x], tl.float32, True, 1)
 
@@ -83,12 +83,14 @@ def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
     The index along axis 1 is a thread's number divided by `LANES`, that along axis 0 the remainder. Triton gives
     threads to axes in that order, because it finds no order in the addresses of Gaussians.
     """
-    if INTERPRETED:
+    if PLAIN:
         size: tl.constexpr = LANES if axis == 0 else SPLAT_LANES
         others = tl.arange(0, size)[:, None] == (tl.arange(0, size) ^ bit)[None, :]
-        if axis == 0:
-            return tl.sum(tl.where(others[:, :, None, None, None], x[None], 0.0), 1)
-        return tl.sum(tl.where(others[None, :, :, None, None], x[:, None], 0.0), 2)
+        if axis == 0:  # with an else: Triton compiles what follows a return in a branch, too
+            moved = tl.sum(tl.where(others[:, :, None, None, None], x[None], 0.0), 1)
+        else:
+            moved = tl.sum(tl.where(others[None, :, :, None, None], x[:, None], 0.0), 2)
+        return moved
     step: tl.constexpr = bit if axis == 0 else bit * LANES
     return tl.inline_asm_elementwise(
         "shfl.sync.bfly.b32 $0, $1, $2, 0x1f, 0xffffffff;", "=f,f,r", [x, step], tl.float32, False, 1
@@ -98,7 +100,7 @@ def _swapped(x: tl.tensor, axis: tl.constexpr, bit: tl.constexpr) -> tl.tensor:
 @triton.jit
 def _ballot(wanted: tl.tensor) -> tl.tensor:
     """Return, in all threads of a warp, a bit for each of them; `wanted` is (threads,)."""
-    if INTERPRETED:
+    if PLAIN:
         bits = tl.reshape(wanted.to(tl.int32) << (tl.arange(0, wanted.shape[0]) % 32), (wanted.shape[0] // 32, 32))
         return tl.reshape(tl.broadcast_to(tl.sum(bits, 1)[:, None], bits.shape), wanted.shape)
     return tl.inline_asm_elementwise(
@@ -110,7 +112,7 @@ def _ballot(wanted: tl.tensor) -> tl.tensor:
 @triton.jit
 def _count_bits(x: tl.tensor) -> tl.tensor:
     """Return how many bits of each number are set."""
-    if INTERPRETED:
+    if PLAIN:
         count = tl.zeros_like(x)
         for i in tl.static_range(32):
             count += (x >> i) & 1
