@@ -72,9 +72,8 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
     import torch
 
     from lapgs_plugin.evaluation.conformance import Subject
-    from lapgs_plugin.rasterizers.choice import RASTERIZERS
+    from lapgs_plugin.rasterizers.choice import OWN, RASTERIZERS
     from lapgs_plugin.rasterizers.extensions import installed_extensions
-    from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
     from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 
     subjects: dict[str, Callable[[], list[Subject]]] = {
@@ -86,7 +85,7 @@ def reachable() -> dict[str, Callable[[], list[Subject]]]:
         for name in installed_extensions():
             subjects[name] = partial(_extension_subjects, name)
     for name in RASTERIZERS:
-        if name != gsplat.NAME or not gsplat.missing():
+        if name not in OWN or not OWN[name].missing():
             subjects.setdefault(name, partial(_subject, name))
     return subjects
 

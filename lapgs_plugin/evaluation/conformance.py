@@ -270,12 +270,23 @@ def _compare(
     errors["centres"] = _largest((actual.means2d - expected.means2d)[shown] / coordinates)
     if errors["centres"] > bounds.mean2d:
         problems.append(f"means2d is off by {errors['centres']:.1e}, expected at most {bounds.mean2d:.0e}")
-    for name, wanted in expected.gradients.items():
+    wanted_gradients = dict(expected.gradients)
+    if subject.semantics.screen_gradient_norms:
+        wanted_gradients["means2d"] = _norms_alone(expected.gradients["means2d"], case)
+    for name, wanted in wanted_gradients.items():
         got = actual.gradients.get(name)
         if got is not None and wanted is not None:
             errors[name], found = _compare_gradients(name, got, wanted, mask.kinks, _bounds(subject, case.name, name))
             problems += found
     return replace(outcome, errors=errors, band_error=band_error, problems=tuple(problems))
+
+
+def _norms_alone(gradient: Tensor | None, case: Case) -> Tensor:
+    """Return a gradient (n, 2) by centres as `Semantics.screen_gradient_norms` says."""
+    assert gradient is not None
+    halves = gradient.new_tensor([case.camera.width / 2, case.camera.height / 2])
+    norms = (gradient * halves).norm(dim=1) / halves[0]
+    return torch.stack([norms, torch.zeros_like(norms)], 1)
 
 
 def _bounds(subject: Subject, case: str, gradient: str) -> Bounds:

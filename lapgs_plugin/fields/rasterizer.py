@@ -55,6 +55,8 @@ class Semantics:
             screen; see `evaluation.conformance.EXPANDED_CONIC`.
         rebuilt_transmittance: True if the backward pass computes the transmittance from a pixel's stored opacity. In
             float32 that is inaccurate where little is left; see `evaluation.conformance.REBUILT_TRANSMITTANCE`.
+        screen_gradient_norms: True if `RenderResult.means2d.grad` holds (g, 0) for each Gaussian, with g the length of
+            the gradient by normalised device coordinates over half the image's width. Density control reads the length.
         departures: reasons by name of the conformance cases in which the image or a gradient differs.
         note: the differences in words, for reports.
     """
@@ -66,6 +68,7 @@ class Semantics:
     blur: float = 0.3
     expanded_conic_gradient: bool = False
     rebuilt_transmittance: bool = False
+    screen_gradient_norms: bool = False
     departures: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
 
@@ -101,6 +104,11 @@ class Rasterizer(ABC):
     name: str
     devices: tuple[str, ...] = ("cuda", "cpu")
     in_current_stream: bool = False
+
+    @classmethod
+    def missing(cls) -> str:
+        """Return why it cannot render on this machine, as a clause; empty if it can, or if creating it tells."""
+        return ""
 
     @property
     def semantics(self) -> Semantics:

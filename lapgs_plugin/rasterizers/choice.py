@@ -15,6 +15,7 @@ from lapgs_plugin.environment.device import chosen_device
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, typed_line
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
+from lapgs_plugin.rasterizers import faster_gs
 from lapgs_plugin.rasterizers.extensions import CONSTANTS, CudaExtension, constants_of, import_extension
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.rasterizers.signed_color import SignedColorRasterizer
@@ -27,7 +28,11 @@ logger = logging.getLogger(__name__)
 RASTER_SETTINGS = "raster"
 """Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
 
-OWN: dict[str, type[Rasterizer]] = {gsplat.NAME: gsplat.GsplatRasterizer, **CPU_RASTERIZERS}
+OWN: dict[str, type[Rasterizer]] = {
+    gsplat.NAME: gsplat.GsplatRasterizer,
+    **CPU_RASTERIZERS,
+    faster_gs.NAME: faster_gs.FasterGsRasterizer,
+}
 RASTERIZERS: Registry[type[Rasterizer]] = Registry(
     "--rasterizer", "lapgs_plugin.rasterizers", Rasterizer, OWN, classes=True
 )
@@ -58,8 +63,8 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
     Args:
         manifest: of the run.
         device: "cuda" or "cpu"; "auto" takes CUDA if there is a device.
-        rasterizer: "auto", "cpu", "oracle", "gsplat", one of an installed package, or the module of an extension. On a
-            CPU the extension's stand-in renders, which has all its settings and is slow.
+        rasterizer: "auto", "cpu", "oracle", "gsplat", "faster-gs", one of an installed package, or the
+            module of an extension. On a CPU the extension's stand-in renders, which has all its settings and is slow.
 
     Raises:
         UserInputError: an unknown device or name, or a device that this machine or the rasterizer does not have.

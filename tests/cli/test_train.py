@@ -113,7 +113,7 @@ def test_training_that_takes_hours_on_a_cpu_is_said_before_and_what_it_advises_i
         (("--supervision", "magic"), "expected reconstructed, online_residual, gt_laplacian"),
         (("--hierarchy", "nested", "--joint", "0.5"), "add --hierarchy laplacian to train residuals"),
         (("--prune", "0.1", "--densify-until", "40"), "--prune 0.1: prunes when a level's densification ends"),
-        (("--rasterizer", "cuda"), "expected auto, gsplat, cpu or oracle"),
+        (("--rasterizer", "cuda"), "expected auto, gsplat, cpu, oracle or faster-gs"),
         (("--strategy", "luck"), "--strategy luck: expected auto, mcmc, 3dgs, multiview"),
         (("--packed", "--sparse-adam", "--rasterizer", "cpu"), "--packed, --sparse-adam with --rasterizer cpu"),
         (("--strategy", "mcmc", "--absgrad"), "--absgrad True with --strategy mcmc: an option of --strategy auto"),

@@ -123,7 +123,7 @@ def test_a_stand_in_asked_for_by_name_honours_the_settings(name: str, setting: d
     [
         ("gpu", "auto", "--device gpu: expected auto, cuda, cpu"),
         ("cuda", "auto", "--device cuda: PyTorch finds no CUDA device"),
-        ("auto", "my_own", "--rasterizer my_own: expected auto, gsplat, cpu, oracle, diff_gaussian"),
+        ("auto", "my_own", "--rasterizer my_own: expected auto, gsplat, cpu, oracle, faster-gs, diff_gaussian"),
         ("cpu", "gsplat", "--rasterizer gsplat: PyTorch finds no CUDA device"),
         ("auto", "gsplat", "--rasterizer gsplat: PyTorch finds no CUDA device"),
     ],

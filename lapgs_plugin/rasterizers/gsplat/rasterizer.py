@@ -129,6 +129,11 @@ class GsplatRasterizer(Rasterizer):
         self._must_be_direct = bool(direct)
         self._cameras = CameraCache()
 
+    @classmethod
+    def missing(cls) -> str:
+        """See `fields.rasterizer.Rasterizer`."""
+        return missing()
+
     @property
     def semantics(self) -> Semantics:
         """Its differences from the oracle."""
