@@ -159,6 +159,7 @@ def _execute_splats(
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
     from lapgs_plugin.errors import MissingExtraError, first_line
+    from lapgs_plugin.rasterizers.gsplat.rasterizer import gsplat_missing
     from lapgs_plugin.runner.splats.driver import SplatDriver, run_bare
     from lapgs_plugin.runner.splats.on_cpu import splats_on_cpu, without_compiled_parts
     from lapgs_plugin.runner.splats.run import SplatRequest
@@ -167,12 +168,13 @@ def _execute_splats(
     path = described.path
     if options.record:
         raise UserInputError(f"--record: {path} records its time and quality itself, in stats/; leave it out")
-    ours_may_render = options.rasterizer == packages.OURS or (options.rasterizer == packages.AUTO and not options.off)
-    on_device = splats_on_cpu() if device == "cpu" else without_compiled_parts(ours_may_render)
+    ours = options.rasterizer == packages.OURS or (options.rasterizer == packages.AUTO and bool(gsplat_missing()))
+    may_be_ours = ours if options.off else options.rasterizer != packages.OWN
+    on_device = splats_on_cpu() if device == "cpu" else without_compiled_parts(may_be_ours)
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(path, arguments) as loaded:
             if options.off:
-                run_bare(loaded, described, device, options.rasterizer)
+                run_bare(loaded, described, device, ours)
                 return
             request = SplatRequest(
                 loaded, described, settings, device, options.rasterizer, options.resume, options.overwrite, measuring,

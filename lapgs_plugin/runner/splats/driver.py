@@ -31,7 +31,6 @@ import torch
 from torch.utils import data
 
 from lapgs_plugin.checkouts.attachment import Attachment, Replacement
-from lapgs_plugin.checkouts.packages import AUTO, OURS
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.splat_script import RASTERIZATION, SplatScript
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError, first_line
@@ -53,17 +52,18 @@ VIEWERLESS = "disable_viewer"
 """Setting of a script that keeps a trainer from starting a viewer."""
 
 
-def run_bare(script: Script, described: SplatScript, device: str, rasterizer: str = AUTO) -> None:
-    """Run a script's main block as it is; on a CPU with gsplat's stand-in, or with our rasterizer if that is wanted.
+def run_bare(script: Script, described: SplatScript, device: str, ours: bool = False) -> None:
+    """Run a script's main block as it is; on a CPU with gsplat's stand-in.
 
     Args:
         script: its definitions have been executed.
         described: what its syntax tree says.
-        device, rasterizer: as of `SplatRequest`; by default the script's own renders.
+        device: as of `SplatRequest`.
+        ours: let our kernels render on a GPU.
     """
     made: list[Replacement] = []
-    if device == "cpu" or rasterizer == OURS:
-        rasterize = _rasterizer(device, vars(script.module)[RASTERIZATION], ours=rasterizer == OURS).render
+    if device == "cpu" or ours:
+        rasterize = _rasterizer(device, vars(script.module)[RASTERIZATION], ours=ours).render
         made.append(Replacement(script.module, RASTERIZATION, lambda _: rasterize, f"{described.trainer}.train()"))
         made += _single_process(script)
     with Attachment(made):
@@ -335,4 +335,5 @@ def _rasterizer(device: str, rasterization: Any, *, ours: bool = False) -> Raste
         return own
     from lapgs_plugin.runner.splats.choice import OurRasterizer
 
+    logger.info("rasterizer: that of lapgs")
     return OurRasterizer.instead_of(own)
