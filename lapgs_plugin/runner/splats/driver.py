@@ -5,7 +5,7 @@ call for each level with residuals, before which the trainer is made anew with t
 replaced, and restored by identity at the end:
 
     `train` of the class                                as above
-    `rasterization`, as the script imports it           signed colours, and coarser levels in the image
+    `rasterization`, as the script imports it           our kernels, signed colours, coarser levels in the image
     `torch.utils.data.DataLoader`, of its datasets      batches of the level's images, which are in memory
     `__init__` of the class, `Parser`                   read a scene once
     `eval` and the like of the class                    do not count as training
