@@ -158,31 +158,28 @@ def _execute_splats(
     """Execute a script whose class trains splats: with a hierarchy, or unchanged with --off."""
     from lapgs_plugin.checkouts.script import loaded_script
     from lapgs_plugin.checkouts.seeds import moved_seeds
-    from lapgs_plugin.environment import is_installed
     from lapgs_plugin.errors import MissingExtraError, first_line
+    from lapgs_plugin.rasterizers.gsplat.rasterizer import gsplat_missing
     from lapgs_plugin.runner.splats.driver import SplatDriver, run_bare
-    from lapgs_plugin.runner.splats.on_cpu import own_ssim, splats_on_cpu
+    from lapgs_plugin.runner.splats.on_cpu import splats_on_cpu, without_compiled_parts
     from lapgs_plugin.runner.splats.run import SplatRequest
     from lapgs_plugin.viewer.preview import save_run_preview
 
     path = described.path
     if options.record:
         raise UserInputError(f"--record: {path} records its time and quality itself, in stats/; leave it out")
-    if options.rasterizer == "lapgs":
-        raise UserInputError(f"--rasterizer lapgs: {path} renders with gsplat's; leave it out, or use `lapgs train`")
-    on_device: AbstractContextManager[None] = nullcontext()
-    if device == "cpu":
-        on_device = splats_on_cpu()
-    elif not is_installed("fused_ssim"):
-        on_device = own_ssim()
+    ours = options.rasterizer == packages.OURS or (options.rasterizer == packages.AUTO and bool(gsplat_missing()))
+    may_be_ours = ours if options.off else options.rasterizer != packages.OWN
+    on_device = splats_on_cpu() if device == "cpu" else without_compiled_parts(may_be_ours)
     try:
         with on_device, moved_seeds(settings.seed), loaded_script(path, arguments) as loaded:
             if options.off:
-                run_bare(loaded, described, device)
+                run_bare(loaded, described, device, ours)
                 return
             request = SplatRequest(
-                loaded, described, settings, device, options.resume, options.overwrite, measuring, watcher
-            )
+                loaded, described, settings, device, options.rasterizer, options.resume, options.overwrite, measuring,
+                watcher,
+            )  # fmt: skip
             folder = SplatDriver(request).run()
         if folder is not None:
             save_run_preview(folder, device)

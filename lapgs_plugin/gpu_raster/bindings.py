@@ -39,16 +39,21 @@ def sort_by_gsplat(
         return compiled.intersect_offset(pairs, count, across, down).view(-1), flat
 
 
+def is_compiled() -> bool:
+    """Return whether gsplat's CUDA part is built already, by its installation or an earlier use; builds nothing."""
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    built = gsplat_built()
+    # gsplat loads what it compiled at an earlier use only where it finds nvcc.
+    compiled = built is not None and CUDA_HOME and any(Path(extensions_folder()).glob("gsplat_cuda/gsplat_cuda*.so"))
+    return bool(built or compiled)
+
+
 @lru_cache(maxsize=1)
 def compiled_functions() -> Any | None:
     """Return gsplat's module of compiled functions; None if it would have to be compiled, or is of another release."""
-    from torch.utils.cpp_extension import CUDA_HOME
-
-    version, built = installed_version("gsplat"), gsplat_built()
-    if built is None or version is None or not version.startswith(KNOWN_RELEASES):
-        return None
-    # gsplat loads what it compiled at an earlier use only where it finds nvcc.
-    if not built and not (CUDA_HOME and any(Path(extensions_folder()).glob("gsplat_cuda/gsplat_cuda*.so"))):
+    version = installed_version("gsplat")
+    if version is None or not version.startswith(KNOWN_RELEASES) or not is_compiled():
         return None
     from gsplat.cuda._backend import _C
 

@@ -124,6 +124,7 @@ def _forward_kernel(
     tl.store(images + at_green, tl.sum(green, 1, keep_dims=True) + left * tl.load(background + 1), inside)
     tl.store(images + at_blue, tl.sum(blue, 1, keep_dims=True) + left * tl.load(background + 2), inside)
     if depth:
+        inverse_depths += image.to(tl.int64) * (width * height)
         tl.store(inverse_depths + pixel, tl.sum(near, 1, keep_dims=True), inside)
 
 
@@ -194,8 +195,8 @@ def _backward_kernel(
     behind += green * tl.load(images + at_green, inside, 0.0) + blue * tl.load(images + at_blue, inside, 0.0)
     near = inside * 0.0
     if depth:
-        near = tl.load(by_depths + pixel, inside, 0.0)
-        behind += near * tl.load(inverse_depths + pixel, inside, 0.0)
+        near = tl.load(by_depths + image.to(tl.int64) * (width * height) + pixel, inside, 0.0)
+        behind += near * tl.load(inverse_depths + image.to(tl.int64) * (width * height) + pixel, inside, 0.0)
     transmittance = tl.where(inside, 1.0, 0.0)
     second = tl.arange(0, splats)[None, None, :, None] == 1  # of a thread's Gaussians
 
@@ -243,7 +244,7 @@ def _backward_kernel(
 
 def blend_forward(
     records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, size: tuple[int, int], count: int,
-    shape: Shape = SHAPE,
+    shape: Shape = SHAPE, alphas: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Blend the Gaussians of each tile by gsplat's rules; arguments are contiguous.
 
@@ -257,13 +258,15 @@ def blend_forward(
         size: (width, height) of the images.
         count: of images.
         shape: of a program's work.
+        alphas: (c, h, w), to be filled with the opacities of records by `Rules.alpha`.
 
     Returns:
         Images (c, h, w, 3); the number of Gaussians in each region that reach it before all its pixels end; and
         words whose bits say which pairs reach a region.
     """
     images = records.new_empty(count, size[1], size[0], 3)
-    return images, *_blend(records, background, offsets, flat, images, images, GSPLAT, 1.0, shape)
+    rules, beside = (GSPLAT, images) if alphas is None else (GSPLAT._replace(depth=True), alphas)
+    return images, *_blend(records, background, offsets, flat, images, beside, rules, 1.0, shape)
 
 
 def blend_family(
@@ -322,7 +325,7 @@ def blend_backward(
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
         rules: those that the images were made by.
-        inverse_depths: with `rules.depth`, the result of `blend_family` and the gradient by it.
+        inverse_depths: with `rules.depth`, those of `blend_family`, or opacities, and the gradient by them.
 
     Returns:
         Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and the others (c, n, OTHERS).

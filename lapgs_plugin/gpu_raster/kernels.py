@@ -33,14 +33,12 @@ from lapgs_plugin.reference_raster.layout import (
     MAX_RADIUS,
     MIN_ROOT,
     MIN_SHARE,
-    NEAR_DEPTH,
     RADIUS_SIGMAS,
     VANISHING,
 )
 
 BLOCK = 128
 """Gaussians of a program."""
-NEAR = tl.constexpr(NEAR_DEPTH)
 REACH = tl.constexpr(3.33)
 """Standard deviations at which every footprint ends, as gsplat has it; fainter Gaussians end where alpha is 1/255."""
 BEYOND = tl.constexpr(0.3)
@@ -85,7 +83,7 @@ def _covariance(
 @triton.jit
 def _shape(
     quaternions: tl.tensor, scales: tl.tensor, row: tl.tensor, modifier: float, family: tl.constexpr,
-    covariances: tl.constexpr,
+    covariances: tl.constexpr, activated: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return w, x, y, z of quaternions and one over their length, scales, and covariances as `_covariance` has.
 
@@ -103,7 +101,8 @@ def _shape(
         s0, s1, s2 = s0 * modifier, s1 * modifier, s2 * modifier
     else:
         w, x, y, z, length = _unit_quaternions(quaternions, row)
-        s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
+        if not activated:
+            s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
     a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
     xx, xy, xz, yy, yz, zz = _covariance(a * s0, b * s1, c * s2, d * s0, e * s1, f * s2, g * s0, h * s1, i * s2)
     return w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz
@@ -112,7 +111,7 @@ def _shape(
 @triton.jit
 def _seen_from(
     poses: tl.tensor, intrinsics: tl.tensor, camera: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor,
-    width: int, height: int, family: tl.constexpr,
+    width: int, height: int, closest: float, family: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip
     """Return a mean in a camera's image plane, and the Jacobian's numbers there.
 
@@ -123,7 +122,7 @@ def _seen_from(
     right = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2) * z + tl.load(pose + 3)
     down = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6) * z + tl.load(pose + 7)
     ahead = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10) * z + tl.load(pose + 11)
-    inverse = 1.0 / tl.where(ahead >= NEAR, ahead, 1.0)
+    inverse = 1.0 / tl.where(ahead >= closest, ahead, 1.0)
     u, v = right * inverse, down * inverse
     fx, cx, fy, cy = tl.load(matrix), tl.load(matrix + 2), tl.load(matrix + 4), tl.load(matrix + 5)
     if family:
@@ -264,22 +263,24 @@ def _project_kernel(
     radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, records: tl.tensor,
     visible_radii: tl.tensor, visible_pixels: tl.tensor,
     width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
-    modifier: float, blur: float, mult: float,
+    modifier: float, blur: float, mult: float, closest: float, farthest: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
     tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    exact: tl.constexpr, snug: tl.constexpr,
+    exact: tl.constexpr, snug: tl.constexpr, activated: tl.constexpr, alpha: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
     mean_x, mean_y, mean_z = load_three(means + 3 * row)
-    _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(quaternions, scales, row, modifier, family, covariances)
+    _, _, _, _, _, _, _, _, xx, xy, xz, yy, yz, zz = _shape(
+        quaternions, scales, row, modifier, family, covariances, activated
+    )
     opacity = tl.load(opacities + row)
-    if not family:
+    if not family and not activated:
         opacity = 1.0 / (1.0 + tl.exp(-opacity))
     camera, placed = first, start + rows
     while camera < first + cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
         u, v, _, _, near, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, family
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, closest, family
         )
         matrix = intrinsics + 9 * camera
         pixel_x = tl.load(matrix) * u + tl.load(matrix + 2)
@@ -293,7 +294,8 @@ def _project_kernel(
             effective = opacity * _dimming(sharp_wide, skew, sharp_high, area, exact)[0]
         if family:
             in_columns, in_rows, radius, seen = _footprint(
-                pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective, here & (depth > NEAR),
+                pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective,
+                here & (depth > closest) & (depth <= farthest),
                 (width + tile - 1) // tile, (height + tile - 1) // tile, mult, snug, tile,
             )  # fmt: skip
             visible = in_columns > 0
@@ -302,7 +304,15 @@ def _project_kernel(
             tl.store(depths + placed, tl.where(seen, depth, 0.0), here)
         else:
             across, down, visible = _half_sides(
-                pixel_x, pixel_y, wide, high, area, opacity, here & (depth >= NEAR), width, height
+                pixel_x,
+                pixel_y,
+                wide,
+                high,
+                area,
+                opacity,
+                here & (depth >= closest) & (depth <= farthest),
+                width,
+                height,
             )
             seen, radius = visible, tl.maximum(across, down)
             tl.store(radii + 2 * placed, across, here)
@@ -321,7 +331,7 @@ def _project_kernel(
         into = records + placed * record
         store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
         store_four(into + 4, wide * inverse, effective, effective, effective, visible)
-        store_four(into + 8, red, green, blue, near, visible)
+        store_four(into + 8, red, green, blue, 0.0 * near + 1.0 if alpha else near, visible)
         if with_geometry:
             tl.store(visible_radii + placed, tl.where(seen, radius, 0).to(tl.int32), here)
             tl.store(visible_pixels + 2 * placed, tl.where(seen, pixel_x - 0.5, 0.0), here)
@@ -386,6 +396,7 @@ def _store_shape_gradients(
     w: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor, length: tl.tensor,
     s0: tl.tensor, s1: tl.tensor, s2: tl.tensor,
     xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor, family: tl.constexpr,
+    activated: tl.constexpr,
 ) -> None:  # fmt: skip
     """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances.
 
@@ -397,10 +408,10 @@ def _store_shape_gradients(
     vx, vy, vz = _times(xx, xy, xz, yy, yz, zz, b, e, h)
     wx, wy, wz = _times(xx, xy, xz, yy, yz, zz, c, f, i)
     by_0, by_1, by_2 = ux * a + uy * d + uz * g, vx * b + vy * e + vz * h, wx * c + wy * f + wz * i
-    if family:
+    if family or activated:
         store_three(by_scale + 3 * rows, 2.0 * s0 * by_0, 2.0 * s1 * by_1, 2.0 * s2 * by_2, here)
     s0, s1, s2 = 2.0 * s0 * s0, 2.0 * s1 * s1, 2.0 * s2 * s2
-    if not family:
+    if not family and not activated:
         store_three(by_scale + 3 * rows, s0 * by_0, s1 * by_1, s2 * by_2, here)
     ux, uy, uz, vx, vy, vz, wx, wy, wz = s0 * ux, s0 * uy, s0 * uz, s1 * vx, s1 * vy, s1 * vz, s2 * wx, s2 * wy, s2 * wz
     of_w = 2.0 * (x * (vz - wy) + y * (wx - uz) + z * (uy - vx))
@@ -459,16 +470,16 @@ def _shape_gradient_kernel(
     poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor, others: tl.tensor,
     by_mean: tl.tensor, by_quaternion: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
     by_color: tl.tensor, by_screen: tl.tensor,
-    width: int, height: int, n: int, cameras: int, modifier: float, blur: float,
+    width: int, height: int, n: int, cameras: int, modifier: float, blur: float, closest: float,
     record: tl.constexpr, gradient: tl.constexpr, stride: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
-    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr,
+    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr, activated: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
     mean_x, mean_y, mean_z = load_three(means + 3 * row)
     w, x, y, z, length, s0, s1, s2, xx, xy, xz, yy, yz, zz = _shape(
-        quaternions, scales, row, modifier, family, covariances
+        quaternions, scales, row, modifier, family, covariances, activated
     )
     none = 0.0 * mean_x
     by_x, by_y, by_z, total = none, none, none, none
@@ -487,7 +498,7 @@ def _shape_gradient_kernel(
         of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
         wide, skew, high = _of_covariance(of_wide, of_skew, of_high, conic_a, conic_b, conic_c, visible)
         u, v, limited_u, limited_v, inverse, _, x_by_x, x_by_z, y_by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, family
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, closest, family
         )
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, x_by_x, x_by_z, y_by_y, y_by_z)
         if dimmed:
@@ -516,7 +527,7 @@ def _shape_gradient_kernel(
                                     0.5 * height, visible, here, columns)  # fmt: skip
         camera += 1
     store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
-    if not family:
+    if not family and not activated:
         opacity = 1.0 / (1.0 + tl.exp(-tl.load(opacities + row)))
         total *= opacity * (1.0 - opacity)
     tl.store(by_opacity + rows, total, here)
@@ -526,7 +537,7 @@ def _shape_gradient_kernel(
     else:
         _store_shape_gradients(
             by_quaternion, by_scale, rows, here, w, x, y, z, length, s0, s1, s2,
-            by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, family,
+            by_xx, by_xy, by_xz, by_yy, by_yz, by_zz, family, activated,
         )  # fmt: skip
 
 
@@ -647,24 +658,24 @@ def _project(
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
         coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
         family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
-        exact=rules.exact, snug=rules.snug,
+        exact=rules.exact, snug=rules.snug, activated=rules.activated, alpha=rules.alpha,
     )  # fmt: skip
 
 
 def project_backward(
     given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
-    found: Tensor, others: Tensor,
+    found: Tensor, others: Tensor, rules: Rules = GSPLAT, numbers: Numbers = NUMBERS,
 ) -> Parameters:  # fmt: skip
     """Return the gradients by parameters, summed over cameras.
 
     Args:
-        given, cameras, degree, signed: arguments of `project`.
+        given, cameras, degree, signed, rules, numbers: arguments of `project`.
         radii, records: its results.
         found, others: gradients (c, n, GRADIENT) and (c, n, 1 or more) as `blend_backward` returns them.
     """
     by = Parameters(*(torch.empty_like(value) for value in given))
     _project_backward(
-        given, None, cameras, degree, signed, radii, records, found, others, by, None, None, GSPLAT, NUMBERS
+        given, None, cameras, degree, signed, radii, records, found, others, by, None, None, rules, numbers
     )
     return by
 
@@ -699,10 +710,10 @@ def _project_backward(
     launch(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
         *given[:4], *cameras[:2], radii, records, found, others, *by, by.means if by_screen is None else by_screen,
-        cameras.width, cameras.height, n, count, *numbers[:2],
+        cameras.width, cameras.height, n, count, numbers.modifier, numbers.blur, numbers.near,
         record=RECORD, gradient=GRADIENT, stride=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
-        dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth,
+        dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth, activated=rules.activated,
     )  # fmt: skip
     if coefficients == 0:
         return

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
+from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 
 
 class Rules(NamedTuple):
@@ -22,6 +23,8 @@ class Rules(NamedTuple):
         exact: they are dimmed as Mip-Splatting does, see `layout.VANISHING`.
         snug: a footprint is the tiles that an ellipse meets instead of those that a square of three sigma does.
         depth: 1 / depth is blended, too, over 0.
+        activated: by gsplat's rules, Gaussians are given by standard deviations and opacities in [0, 1].
+        alpha: `depth` blends 1 in the place of 1 / depth, which makes the opacity of the image.
     """
 
     family: bool = False
@@ -31,23 +34,28 @@ class Rules(NamedTuple):
     exact: bool = False
     snug: bool = False
     depth: bool = False
+    activated: bool = False
+    alpha: bool = False
 
 
 GSPLAT = Rules()
 
 
 class Numbers(NamedTuple):
-    """Hold numbers of the family's rules.
+    """Hold numbers of the rules.
 
     Attributes:
         modifier: factor on standard deviations.
         blur: added to the diagonal of the 2D covariance, in px^2.
         mult: factor on half the squared distance at which alpha is 1/255, for the ellipse of `Rules.snug`.
+        near, far: depths between which Gaussians are seen.
     """
 
     modifier: float = 1.0
     blur: float = PIXEL_VARIANCE
     mult: float = 1.0
+    near: float = NEAR_DEPTH
+    far: float = math.inf
 
 
 NUMBERS = Numbers()

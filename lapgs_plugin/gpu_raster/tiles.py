@@ -34,7 +34,7 @@ _rooms: dict[tuple[Any, ...], float] = {}  # by device, size and number of image
 
 def blend_in_tiles(
     projected: Sequence[Tensor], background: Tensor, size: tuple[int, int], count: int = 1,
-    of_image: Tensor | None = None,
+    of_image: Tensor | None = None, alphas: Tensor | None = None,
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """Sort Gaussians into tiles, front to back, and blend them.
 
@@ -45,6 +45,7 @@ def blend_in_tiles(
         size: (width, height) of all images.
         count: number of images.
         of_image: in a list, the image number (n,) of each Gaussian.
+        alphas: as `blend_forward` takes them.
 
     Returns:
         Offsets and Gaussians of pairs as `blend_forward` takes them, and its results.
@@ -55,9 +56,10 @@ def blend_in_tiles(
     from lapgs_plugin.gpu_raster.blend_kernels import blend_forward
 
     radii, means2d, depths, records = projected[:4]
+    filled: dict[str, Any] = {} if alphas is None else {"alphas": alphas}
     if records.is_cuda and (compiled := compiled_functions()) is not None:
         tiles = sort_by_gsplat(compiled, radii, means2d, depths, of_image, count, size)
-        return tiles, blend_forward(records, background, *tiles, size, count)
+        return tiles, blend_forward(records, background, *tiles, size, count, **filled)
     from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     grid = grid_of(size)
@@ -65,7 +67,7 @@ def blend_in_tiles(
 
     def attempt(room: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
         tiles = sort_by_tile(radii, means2d, order, ends, of_image, count, grid, room)
-        return tiles, blend_forward(records, background, *tiles, size, count)
+        return tiles, blend_forward(records, background, *tiles, size, count, **filled)
 
     return _with_room((records.device, *size, count), ends[-1], attempt)
 

@@ -17,8 +17,10 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.gaussian_field import field_from_splats
+from lapgs_plugin.rasterizers.gsplat.rasterization import refusal
 from lapgs_plugin.reference_raster import gsplat as stand_in
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
+from lapgs_plugin.runner.splats import on_cpu
 from lapgs_plugin.runner.splats.on_cpu import rasterization_on_cpu
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.scene import load_scene
@@ -134,6 +136,22 @@ def test_each_iteration_renders_its_level(kind: str, scene: Path, tmp_path: Path
     assert [each.size for each in trained] == [(32, 24)] * 10 + [(64, 48)] * 20
     assert [each.signed for each in trained] == [False] * 10 + [kind == "laplacian"] * 20
     assert torch.allclose(trained[0].K[:2] * 2, trained[-1].K[:2])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_our_kernels_can_do_what_the_script_asks_for(
+    kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+
+    def rasterize(**inputs: Any) -> Any:
+        refused.append(refusal(inputs))
+        return rasterization_on_cpu(**inputs)
+
+    monkeypatch.setattr(on_cpu, "rasterization_on_cpu", rasterize)
+    train(scene, tmp_path / "run", lapgs=hierarchy(kind, "--rasterizer", "lapgs"))
+    assert len(refused) > 30
+    assert set(refused) == {""}
 
 
 def test_three_levels_of_odd_sizes(big: Path, tmp_path: Path) -> None:
@@ -287,7 +305,6 @@ REFUSED: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], str]] = {
     "inherit": (("--inherit", "full"), (), "--inherit full"),
     "masks": (("--masks", "masks"), (), "--masks masks"),
     "breakdown": (("--breakdown",), (), "--breakdown"),
-    "rasterizer": (("--rasterizer", "lapgs"), (), "--rasterizer lapgs"),
     "record": (("--off", "--record"), (), "--record"),
     "patches": ((), ("--patch_size", 16), "--patch_size 16"),
     "lens": ((), ("--camera_model", "fisheye"), "--camera_model fisheye"),

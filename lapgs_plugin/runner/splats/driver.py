@@ -5,7 +5,7 @@ call for each level with residuals, before which the trainer is made anew with t
 replaced, and restored by identity at the end:
 
     `train` of the class                                as above
-    `rasterization`, as the script imports it           signed colours, and coarser levels in the image
+    `rasterization`, as the script imports it           our kernels, signed colours, coarser levels in the image
     `torch.utils.data.DataLoader`, of its datasets      batches of the level's images, which are in memory
     `__init__` of the class, `Parser`                   read a scene once
     `eval` and the like of the class                    do not count as training
@@ -52,17 +52,18 @@ VIEWERLESS = "disable_viewer"
 """Setting of a script that keeps a trainer from starting a viewer."""
 
 
-def run_bare(script: Script, described: SplatScript, device: str) -> None:
+def run_bare(script: Script, described: SplatScript, device: str, ours: bool = False) -> None:
     """Run a script's main block as it is; on a CPU with gsplat's stand-in.
 
     Args:
         script: its definitions have been executed.
         described: what its syntax tree says.
         device: as of `SplatRequest`.
+        ours: let our kernels render on a GPU.
     """
     made: list[Replacement] = []
-    if device == "cpu":
-        rasterize = _rasterizer(device, None).rasterization
+    if device == "cpu" or ours:
+        rasterize = _rasterizer(device, vars(script.module)[RASTERIZATION], ours=ours).render
         made.append(Replacement(script.module, RASTERIZATION, lambda _: rasterize, f"{described.trainer}.train()"))
         made += _single_process(script)
     with Attachment(made):
@@ -83,7 +84,8 @@ class SplatDriver:
         self._init: Callable[..., None]
         self._made_with: tuple[tuple[Any, ...], dict[str, Any]] = (), {}
         self._parsers: dict[str, Any] = {}
-        self._rasterizer = _rasterizer(request.device, vars(self._module)[RASTERIZATION])
+        self._own = _rasterizer(request.device, vars(self._module)[RASTERIZATION])
+        self._rasterizer = self._own  # of calls outside of a stage
         self._run: SplatRun
         self._stage: SplatStage | None = None
         self._advance: Callable[[], None] | None = None
@@ -174,7 +176,7 @@ class SplatDriver:
 
     def _rasterize(self, *args: Any, **inputs: Any) -> Any:
         if self._stage is None:
-            return self._rasterizer.rasterization(*args, **inputs)
+            return self._rasterizer.rasterization(*args, **inputs) if args else self._rasterizer.render(**inputs)
         if args:
             raise UserInputError(
                 f"{self._request.script.path} calls {RASTERIZATION}() with {len(args)} arguments without names, "
@@ -187,8 +189,8 @@ class SplatDriver:
 
         @wraps(original)
         def train(trainer: Any) -> Any:
-            with prepare(self._request, self._rasterizer, trainer, self._began) as run:
-                self._run, self._folder = run, run.archive.path()
+            with prepare(self._request, self._own, trainer, self._began) as run:
+                self._run, self._folder, self._rasterizer = run, run.archive.path(), run.rasterizer
                 run.request.watcher.run_started(run.archive)
                 try:
                     returned = self._train_stages() if run.settings.has_residuals else self._train_nested()
@@ -319,8 +321,8 @@ def _in_process(main: Callable[..., Any], config: Any, verbose: bool = False) ->
     return main(0, 0, 1, config)
 
 
-def _rasterizer(device: str, rasterization: Any) -> Rasterizer:
-    """Return the functions that a script renders with, or their stand-ins on a CPU."""
+def _rasterizer(device: str, rasterization: Any, *, ours: bool = False) -> Rasterizer:
+    """Return the functions that a script renders with, ours in their place, or their stand-ins on a CPU."""
     if device == "cpu":
         from lapgs_plugin.reference_raster import gsplat as stand_in
         from lapgs_plugin.runner.splats.on_cpu import rasterization_on_cpu
@@ -328,4 +330,10 @@ def _rasterizer(device: str, rasterization: Any) -> Rasterizer:
         return Rasterizer(rasterization_on_cpu, stand_in.spherical_harmonics)
     from gsplat import spherical_harmonics
 
-    return Rasterizer(rasterization, spherical_harmonics)
+    own = Rasterizer(rasterization, spherical_harmonics)
+    if not ours:
+        return own
+    from lapgs_plugin.runner.splats.choice import OurRasterizer
+
+    logger.info("rasterizer: that of lapgs")
+    return OurRasterizer.instead_of(own)

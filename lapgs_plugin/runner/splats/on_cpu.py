@@ -1,4 +1,4 @@
-"""Let a script around gsplat run on a CPU, with stand-ins of `rasterization` and of its packages' CUDA functions."""
+"""Let a script around gsplat run without compiled packages, on a CPU with a stand-in of `rasterization`, too."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.attachment import replaced
 from lapgs_plugin.checkouts.cpu_device import cuda_on_cpu
+from lapgs_plugin.environment import is_installed
 from lapgs_plugin.family import fused_ssim as ssim
 from lapgs_plugin.family.forks import compute_relocation
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.pose import with_pose_gradient
+from lapgs_plugin.gpu_raster.bindings import is_compiled
 from lapgs_plugin.reference_raster import gsplat as stand_in
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.reference_raster.oracle import world_covariances
@@ -90,6 +92,29 @@ def splats_on_cpu() -> Iterator[None]:
     with ExitStack() as stack:
         stack.enter_context(cuda_on_cpu(None))
         stack.enter_context(own_ssim())
+        stack.enter_context(own_strategy_functions())
+        yield
+
+
+@contextmanager
+def without_compiled_parts(ours_may_render: bool) -> Iterator[None]:
+    """Let our functions take the places of compiled ones that are not there, on a GPU.
+
+    Args:
+        ours_may_render: whether gsplat need not be built.
+    """
+    with ExitStack() as stack:
+        if not is_installed("fused_ssim"):
+            stack.enter_context(own_ssim())
+        if ours_may_render and not is_compiled():
+            stack.enter_context(own_strategy_functions())
+        yield
+
+
+@contextmanager
+def own_strategy_functions() -> Iterator[None]:
+    """Let gsplat's strategies call our functions inside, which need no CUDA part of gsplat's."""
+    with ExitStack() as stack:
         with suppress(ImportError):  # the script says what it needs
             ops = import_module("gsplat.strategy.ops")
             own = {"compute_relocation": _relocation, "quat_scale_to_covar_preci": _covariances}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from lapgs_plugin.checkouts.packages import AUTO, OURS
 from lapgs_plugin.checkouts.script import Script
 from lapgs_plugin.checkouts.splat_script import SplatScript
 from lapgs_plugin.checkouts.training_call import StageWindow
@@ -25,13 +26,14 @@ from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.registry import HOOKS, chosen_entries
 from lapgs_plugin.runner.manifest import require_same_run
+from lapgs_plugin.runner.rasterizer_choice import CHOICE, Decision, recorded_choice
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.splats.schedule import THRESHOLD
 from lapgs_plugin.runner.splats.signed import Rasterizer
 from lapgs_plugin.runner.splats.views import SplatView, read_views
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import require_place, require_room, require_utf8
-from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.runs.manifest import Manifest, SceneReference, read_manifest
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.trained_cameras import TrainedCameras
 from lapgs_plugin.runs.watcher import Watcher
@@ -56,6 +58,7 @@ class SplatRequest:
         described: what its syntax tree says.
         settings: of the hierarchy.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
+        rasterizer: one of `packages.CHOICES`, of no effect on a CPU.
         resume: continue the run in the output folder.
         overwrite: replace the run in the output folder.
         measuring: which figures are measured.
@@ -66,6 +69,7 @@ class SplatRequest:
     described: SplatScript
     settings: RunSettings = field(default_factory=RunSettings)
     device: str = "cuda"
+    rasterizer: str = AUTO
     resume: bool = False
     overwrite: bool = False
     measuring: MeasuringOptions = field(default_factory=MeasuringOptions)
@@ -109,12 +113,12 @@ class SplatRun:
 
 
 @contextmanager
-def prepare(request: SplatRequest, rasterizer: Rasterizer, trainer: Any, began: int) -> Iterator[SplatRun]:
+def prepare(request: SplatRequest, own: Rasterizer, trainer: Any, began: int) -> Iterator[SplatRun]:
     """Yield a run that is ready to train. Its folder is locked for writing inside the block.
 
     Args:
         request: what the user asks for.
-        rasterizer: of the script.
+        own: the script's rasterizer.
         trainer: the script's object whose `train` was called.
         began: file-system time (ns) just before the script's main block.
 
@@ -152,7 +156,9 @@ def prepare(request: SplatRequest, rasterizer: Rasterizer, trainer: Any, began: 
     size = smallest_of(view.camera for view in (*train, *test))
     settings = settings.for_size(size)
     plan = StagePlan.create(size, config.max_steps, settings.levels, settings.shares, settings.kind)
-    with _open_archive(request, folder, _manifest(request, settings, config, plan, reference), began) as archive:
+    rasterizer, decision = _choose_rasterizer(request, own, trainer, train, plan, folder)
+    manifest = _manifest(request, settings, config, plan, reference, decision)
+    with _open_archive(request, folder, manifest, began) as archive:
         for attribute, value in vars(trainer).items():
             if attribute.endswith("_dir"):  # those of an earlier run are removed, the script's new ones with them
                 Path(value).mkdir(parents=True, exist_ok=True)
@@ -161,6 +167,27 @@ def prepare(request: SplatRequest, rasterizer: Rasterizer, trainer: Any, began: 
         )
         write_cameras(run)
         yield run
+
+
+def _choose_rasterizer(
+    request: SplatRequest,
+    own: Rasterizer,
+    trainer: Any,
+    views: Sequence[SplatView],
+    plan: StagePlan,
+    folder: Path,
+) -> tuple[Rasterizer, Decision | None]:
+    """Return what renders a run, and why; on a CPU the stand-in, without a reason."""
+    if request.device == "cpu":
+        return own, None
+    from lapgs_plugin.runner.splats.choice import OurRasterizer, decided, sample_calls
+
+    kept = recorded_choice(read_manifest(folder)) if request.resume else None
+    levels = sorted({stage.level for stage in plan})
+    calls = sample_calls(trainer, views, levels, torch.device(request.device))
+    decision = kept or decided(request.rasterizer, own, calls, tries=request.settings.dry_run)
+    logger.info("rasterizer: %s", decision.why)
+    return (OurRasterizer.instead_of(own) if decision.rasterizer == OURS else own), decision
 
 
 def _open_archive(request: SplatRequest, folder: Path, manifest: Manifest, began: int) -> RunArchive:
@@ -271,7 +298,12 @@ def scene_reference(trainer: Any) -> SceneReference:
 
 
 def _manifest(
-    request: SplatRequest, settings: RunSettings, config: Any, plan: StagePlan, scene: SceneReference
+    request: SplatRequest,
+    settings: RunSettings,
+    config: Any,
+    plan: StagePlan,
+    scene: SceneReference,
+    decision: Decision | None,
 ) -> Manifest:
     script = request.script.path
     return Manifest(
@@ -286,6 +318,7 @@ def _manifest(
         settings={
             "backbone": {"name": script.stem, "checkout": str(script.parent), "arguments": sys.argv[1:]},
             RASTER_SETTINGS: {"antialiased": True} if getattr(config, "antialiased", False) else {},
+            **({} if decision is None else {CHOICE: decision.for_manifest()}),
             "iterations": plan.iterations,
             **settings.for_manifest(),
         },

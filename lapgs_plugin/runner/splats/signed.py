@@ -35,6 +35,10 @@ class Rasterizer:
     rasterization: Rasterize
     spherical_harmonics: Callable[..., Tensor]
 
+    def render(self, **inputs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Call `rasterization`."""
+        return self.rasterization(**inputs)
+
     def signed(self, **inputs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Call `rasterization` for a residual: raw SH values as colours, over black."""
         degree, coefficients = inputs.pop("sh_degree"), inputs["colors"].float()  # (n, k, 3)
@@ -123,7 +127,7 @@ class CoarserLevels:
         if field.signed:
             own = {**own, **({"render_mode": "RGB"} if "render_mode" in own else {})}
             return self._rasterizer.signed(**own)[0]
-        return self._rasterizer.rasterization(**own)[0]
+        return self._rasterizer.render(**own)[0]
 
     def _up(self, image: Tensor, size: tuple[int, int]) -> Tensor:
         """Upsample images (c, h, w, channels) by one level to a size."""

@@ -24,7 +24,7 @@ from lapgs_plugin.runner.splats.joint import follow, trainable
 from lapgs_plugin.runner.splats.run import SplatRun, write_cameras
 from lapgs_plugin.runner.splats.schedule import opacity_weight
 from lapgs_plugin.runner.splats.signed import COLORS, CoarserLevels, FinishedField, compose
-from lapgs_plugin.runner.splats.views import SplatView, level_item, level_pixels
+from lapgs_plugin.runner.splats.views import SplatView, camera_inputs, level_item, level_pixels
 from lapgs_plugin.runs.image_store import chosen_precision
 from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
@@ -131,7 +131,7 @@ class SplatStage:
     def rasterize(self, **inputs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Answer a call of the script's `rasterization`: with the coarser levels in the image of a residual."""
         if self._coarser is None:
-            return self._run.rasterizer.rasterization(**inputs)
+            return self._run.rasterizer.render(**inputs)
         if not torch.is_grad_enabled() and self.stage.level > 0:
             return self._rasterize_full(inputs)
         return compose(self._run.rasterizer, inputs, self._predict)
@@ -164,25 +164,13 @@ class SplatStage:
         own = FinishedField(self.stage.level, self.stage.signed, self._splats()).inputs()
         inputs = {**self._camera_inputs(view), **own}
         if self._coarser is None:
-            image = self._run.rasterizer.rasterization(**inputs)[0]
+            image = self._run.rasterizer.render(**inputs)[0]
         else:
             image = compose(self._run.rasterizer, inputs, self._coarser.predict)[0]
         return image[0].permute(2, 0, 1)
 
     def _camera_inputs(self, view: SplatView) -> dict[str, Any]:
-        """Return the inputs of `rasterization` for a view at the level's size, besides those of a field."""
-        device, config = self._run.device, self._run.config
-        width, height = level_size(view.size, self.stage.level)
-        return {
-            "viewmats": view.camera.world_to_camera.to(device)[None],
-            "Ks": level_intrinsics(view.item["K"], view.size, self.stage.level).to(device)[None].float(),
-            "width": width,
-            "height": height,
-            "near_plane": config.near_plane,
-            "far_plane": config.far_plane,
-            "rasterize_mode": "antialiased" if getattr(config, "antialiased", False) else "classic",
-            "packed": getattr(config, "packed", False),
-        }
+        return camera_inputs(view, self.stage.level, self._run.config, self._run.device)
 
     @property
     def _moves_cameras(self) -> bool:

@@ -147,3 +147,24 @@ def level_pixels(view: SplatView, images: LevelImages) -> dict[str, Tensor]:
     image = stored.float() if stored.dtype == torch.uint8 else stored.float() * 255
     weights = images.get_weights(view.name) if MASK in view.item else None
     return {IMAGE: image.permute(1, 2, 0), **({} if weights is None else {MASK: weights[0] > 1 - 0.5 / 255})}
+
+
+def camera_inputs(view: SplatView, level: int, config: Any, device: torch.device) -> dict[str, Any]:
+    """Return the inputs of `rasterization` for a view at a level's size, besides those of a field.
+
+    Args:
+        view, level: which camera, and how many halvings smaller.
+        config: settings of the script.
+        device: that renders.
+    """
+    width, height = level_size(view.size, level)
+    return {
+        "viewmats": view.camera.world_to_camera.to(device)[None],
+        "Ks": level_intrinsics(view.item["K"], view.size, level).to(device)[None].float(),
+        "width": width,
+        "height": height,
+        "near_plane": config.near_plane,
+        "far_plane": config.far_plane,
+        "rasterize_mode": "antialiased" if getattr(config, "antialiased", False) else "classic",
+        "packed": getattr(config, "packed", False),
+    }
