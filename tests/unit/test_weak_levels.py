@@ -7,16 +7,11 @@ from typing import Any
 
 import pytest
 
-from lapgs_plugin.evaluation.metrics import psnr
-from lapgs_plugin.ops.composition import to_full_size
-from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs, weak_levels
-from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Mcmc
-from tests.training_runs import Said, train
+from tests.training_runs import Said, rendered_gains, train
 from tests.training_scene import ring_scene
 
 INSTEAD = "--hierarchy nested, --levels 1 or more photos"
@@ -91,19 +86,6 @@ def test_gains_are_those_of_the_last_measurement() -> None:
     assert finest_gains(last_view_psnrs(history[:2])) == []
 
 
-def rendered_gains(archive: RunArchive, scene: Scene) -> list[float]:
-    """What the finest level adds to each held-out view by the run folder alone."""
-    renderer = run_renderer(archive, "cpu")
-    gains = []
-    for view in scene.test:
-        images = renderer.render(view.camera).composed
-        whole = {
-            level: to_full_size(image, view.camera.size, level, renderer.pyramid) for level, image in images.items()
-        }
-        gains.append(psnr(whole[0], view.image) - psnr(whole[1], view.image))
-    return gains
-
-
 @pytest.mark.parametrize(
     "changed", [{"joint": 0.5}, {"joint": 0.0}, {"hierarchy": "nested"}, {"keep": "best"}], ids=str
 )
@@ -113,7 +95,7 @@ def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any]
     settings = TrainSettings(iterations=60, levels=2, sh_degree=0, exposure="off", **changed)
     archive = train(tmp_path / "run", scene, settings)
     gains = finest_gains(last_view_psnrs(archive.history()))
-    assert gains == pytest.approx(rendered_gains(archive, scene), abs=1e-3)
+    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)
 
 
 def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Path) -> None:
@@ -121,7 +103,7 @@ def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Pat
     settings = TrainSettings(iterations=40, levels=2, sh_degree=0, exposure="off")
     archive = train(tmp_path / "run", scene, settings, test_every=15)
     gains = finest_gains(last_view_psnrs(archive.history()))
-    assert gains == pytest.approx(rendered_gains(archive, scene), abs=1e-3)
+    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)
 
 
 def test_a_residual_that_dies_is_a_line_of_its_training(tmp_path: Path) -> None:
