@@ -95,7 +95,7 @@ def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any]
     settings = TrainSettings(iterations=60, levels=2, sh_degree=0, exposure="off", **changed)
     archive = train(tmp_path / "run", scene, settings)
     gains = finest_gains(last_view_psnrs(archive.history()))
-    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)
+    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
 
 
 def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Pat
     settings = TrainSettings(iterations=40, levels=2, sh_degree=0, exposure="off")
     archive = train(tmp_path / "run", scene, settings, test_every=15)
     gains = finest_gains(last_view_psnrs(archive.history()))
-    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)
+    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
 
 
 def test_a_residual_that_dies_is_a_line_of_its_training(tmp_path: Path) -> None:
