@@ -38,7 +38,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
-from lapgs_plugin.runs.training_figures import VIEW_PSNR, finest_gains, weak_levels
+from lapgs_plugin.runs.training_figures import VIEW_PSNR, finest_gains, last_view_psnrs, smaller_gains, weak_levels
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -116,8 +116,11 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
 def _weak_levels(run: MeasuredRun) -> list[str]:
     """Return lines about levels that hardly matter; about gains only if views were held out."""
     manifest, metrics = run.archive.manifest, run.metrics
-    levels = metrics["levels"] if metrics["split"] == "test" else {}
-    gains = finest_gains({int(level): figures.get(VIEW_PSNR, ()) for level, figures in levels.items()})
+    gains: Sequence[float] = ()
+    if metrics["split"] == "test":
+        at_end = {int(level): figures.get(VIEW_PSNR, ()) for level, figures in metrics["levels"].items()}
+        logged = last_view_psnrs(run.archive.history(), along=False)
+        gains = smaller_gains(finest_gains(at_end), finest_gains(logged))
     return weak_levels(manifest.records, gains, manifest.settings, advised=knows_options(manifest))
 
 

@@ -59,16 +59,23 @@ def finest_gains(psnrs: Mapping[int, Sequence[float]]) -> list[float]:
     return [ours - without for ours, without in zip(fine, coarse, strict=True)] if len(fine) == len(coarse) else []
 
 
-def last_view_psnrs(history: Iterable[Mapping[str, Any]]) -> dict[int, list[float]]:
+def smaller_gains(*gains: Sequence[float]) -> Sequence[float]:
+    """Return those gains that have the smaller mean; empty if all are."""
+    return min(filter(None, gains), key=fmean, default=())
+
+
+def last_view_psnrs(history: Iterable[Mapping[str, Any]], *, along: bool) -> dict[int, list[float]]:
     """Return the last PSNR of each held-out view by level, from the entries of a run's history.
 
-    If the coarser levels trained along with level 0, those of level 1 are at its end.
+    Args:
+        along: whether figures of level 1 are those at the end of level 0, with which it may have trained along, instead
+            of those at its own end.
     """
     psnrs: dict[int, list[float]] = {}
     for entry in history:
         if VIEW_PSNR in entry:
             psnrs[entry["level"]] = entry[VIEW_PSNR]
-        if COARSER_VIEW_PSNR in entry:
+        if along and COARSER_VIEW_PSNR in entry:
             psnrs[entry["level"] + 1] = entry[COARSER_VIEW_PSNR]
     return psnrs
 

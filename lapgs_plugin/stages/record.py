@@ -16,7 +16,14 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory
-from lapgs_plugin.runs.training_figures import COARSER_VIEW_PSNR, VIEW_PSNR, finest_gains, last_view_psnrs, weak_levels
+from lapgs_plugin.runs.training_figures import (
+    COARSER_VIEW_PSNR,
+    VIEW_PSNR,
+    finest_gains,
+    last_view_psnrs,
+    smaller_gains,
+    weak_levels,
+)
 
 HISTORY_ENTRIES = 200
 """Approximate number of history entries of a run, without those of held-out views."""
@@ -223,8 +230,8 @@ class StageRecord(LoopRecord):
     def weak_lines(self) -> list[str]:
         """Return a line for the user for each sign that the level that was archived last hardly matters."""
         manifest = self.archive.manifest
-        gains = finest_gains(last_view_psnrs(self.archive.history())) if self.stage.level == 0 else []
-        return weak_levels(manifest.records[-1:], gains, manifest.settings)
+        gains = [finest_gains(last_view_psnrs(self.archive.history(), along=along)) for along in (True, False)]
+        return weak_levels(manifest.records[-1:], smaller_gains(*gains), manifest.settings)
 
     @contextmanager
     def after_archive(self, purpose: str) -> Iterator[None]:

@@ -110,7 +110,7 @@ def test_levels_are_archived(finished: Path) -> None:
     assert found == [(1, (32, 24), 10, False), (0, (64, 48), 20, signed)]
     assert [archive.field(level).signed for level in (1, 0)] == [False, signed]
     assert {entry["level"] for entry in archive.history() if "psnr" in entry} == {0, 1}
-    gains = finest_gains(last_view_psnrs(archive.history()))
+    gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, run_scene(archive).test), abs=1e-3)  # 1e-7 seen
 
 

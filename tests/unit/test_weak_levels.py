@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from lapgs_plugin.runs.manifest import LevelRecord
-from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs, weak_levels
+from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs, smaller_gains, weak_levels
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Mcmc
 from tests.training_runs import Said, rendered_gains, train
@@ -80,10 +80,13 @@ def test_gains_are_those_of_the_last_measurement() -> None:
         {"level": 0, "iteration": 4, "psnr": 25.0},
         {"level": 0, "iteration": 9, "view_psnr": [21.0, 33.0], "coarser_view_psnr": [20.5, 30.5]},
     ]
-    assert finest_gains(last_view_psnrs(history)) == [0.5, 2.5]
+    at_end, since = (finest_gains(last_view_psnrs(history, along=along)) for along in (True, False))
+    assert (at_end, since) == ([0.5, 2.5], [1.0, 3.0])
+    assert smaller_gains(since, [], at_end) == at_end
+    assert smaller_gains([]) == ()
     del history[2]["coarser_view_psnr"]  # of nested levels
-    assert finest_gains(last_view_psnrs(history)) == [1.0, 3.0]
-    assert finest_gains(last_view_psnrs(history[:2])) == []
+    assert finest_gains(last_view_psnrs(history, along=True)) == [1.0, 3.0]
+    assert finest_gains(last_view_psnrs(history[:2], along=True)) == []
 
 
 @pytest.mark.parametrize(
@@ -94,7 +97,7 @@ def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any]
     scene = ring_scene(train=12, test=4)
     settings = TrainSettings(iterations=60, levels=2, sh_degree=0, exposure="off", **changed)
     archive = train(tmp_path / "run", scene, settings)
-    gains = finest_gains(last_view_psnrs(archive.history()))
+    gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
 
 
@@ -102,7 +105,7 @@ def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Pat
     scene = ring_scene(train=5, test=4)
     settings = TrainSettings(iterations=40, levels=2, sh_degree=0, exposure="off")
     archive = train(tmp_path / "run", scene, settings, test_every=15)
-    gains = finest_gains(last_view_psnrs(archive.history()))
+    gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
 
 
