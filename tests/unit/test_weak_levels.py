@@ -119,3 +119,15 @@ def test_a_residual_that_dies_is_a_line_of_its_training(tmp_path: Path) -> None:
     assert named == [line for line in said.lines if line.endswith(INSTEAD)]
     assert len(named) == 1
     assert f"{residual.num_gaussians} of the 600" in named[0]
+
+
+def test_a_residual_that_learns_nothing_is_a_line_of_its_training(tmp_path: Path) -> None:
+    """A colour rate of almost 0 leaves it transparent; all of its Gaussians stay."""
+    settings = TrainSettings(
+        iterations=1000, levels=2, split="1/2,1/2", sh_degree=0, exposure="off", joint=0.0, residual_color_rate=1e-6
+    )
+    said = Said()
+    train(tmp_path / "run", ring_scene(train=5, test=4), settings, monitor=said)
+    (line,) = (line for line in said.lines if line.startswith("level "))
+    assert line.startswith("level 0 changes the PSNR of 4 held-out images by ")
+    assert line.endswith(INSTEAD)
