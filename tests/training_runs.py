@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
-from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
@@ -72,6 +76,19 @@ def _train(
 def plys(archive: RunArchive) -> list[bytes]:
     """The fields' files, coarsest level first."""
     return [archive.field_path(level).read_bytes() for level in archive.available_levels]
+
+
+def rendered_gains(archive: RunArchive, views: Sequence[View]) -> list[float]:
+    """Return the decibels that the finest level adds to the PSNR of each view, rendered from the run folder."""
+    renderer = run_renderer(archive, "cpu")
+    gains = []
+    for view in views:
+        images = renderer.render(view.camera).composed
+        whole = {
+            level: to_full_size(image, view.camera.size, level, renderer.pyramid) for level, image in images.items()
+        }
+        gains.append(psnr(whole[0], view.image) - psnr(whole[1], view.image))
+    return gains
 
 
 class StopAt(Monitor):

@@ -15,7 +15,7 @@ Its keys, with levels as text as JSON requires:
     train_seconds and other figures of training: see `training_figures`.
     levels: by level, the figures of `OF_LEVELS` and two means over the views: psnr of I_hat^l against level l of the
         photo's Gaussian pyramid, both at the level's size; and upsampled_psnr of I_hat^l upsampled to full resolution
-        against the photo, which is the quality without the finer levels.
+        against the photo, which is the quality without the finer levels. view_psnr has the latter of each view.
     views: name, psnr, fitted_psnr, ssim and lpips_<variant> of each view, in the scene's order.
     rasterizer, versions: the rasterizer and the versions of packages that rendered the views.
 """
@@ -44,7 +44,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.results import MEASURED
-from lapgs_plugin.runs.training_figures import training_figures
+from lapgs_plugin.runs.training_figures import VIEW_PSNR, training_figures
 from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
@@ -58,6 +58,7 @@ METRIC_KEYS = {
 
 OF_LEVELS = (
     *("iterations", "image_size", "train_seconds", "num_gaussians", "mean_gaussians", "peak_gaussians"),
+    "start_gaussians",
     *("breakdown_seconds", "gpu_busy_seconds", "memory_bytes"),
 )
 """Figures of a level that are those of its record."""
@@ -107,6 +108,7 @@ def evaluate_run(
         "levels": {
             str(record.level): {
                 **means([levels[record.level] for _, levels in measured]),
+                VIEW_PSNR: [levels[record.level]["upsampled_psnr"] for _, levels in measured],
                 **{key: getattr(record, key) for key in OF_LEVELS},
             }
             for record in records

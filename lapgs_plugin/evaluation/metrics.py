@@ -104,7 +104,14 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 def mean_quality(pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
     """Return the means of "psnr" (dB) and "ssim" over pairs of images, with masks or without; empty without images."""
-    return means([{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs])
+    return means(qualities(pairs))
+
+
+def qualities(
+    pairs: Iterable[tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor | None]],
+) -> list[dict[str, float]]:
+    """Return the "psnr" (dB) and "ssim" of each pair of images, with masks or without."""
+    return [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in pairs]
 
 
 def means(entries: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -38,7 +38,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
-from lapgs_plugin.runs.training_figures import weak_levels
+from lapgs_plugin.runs.training_figures import VIEW_PSNR, finest_gains, last_view_psnrs, smaller_gains, weak_levels
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -100,11 +100,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         rows=comparison_rows([measured.metrics for measured in runs]),
         charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,
-        weak=weak_levels(
-            run.archive.manifest.records,
-            {int(level): figures["upsampled_psnr"] for level, figures in run.metrics["levels"].items()},
-            MEASURED[run.metrics["split"]],
-        ),
+        weak=_weak_levels(run),
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
         strips=view_strips(run, renderers, options.scene),
@@ -115,6 +111,17 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
     path = run.archive.path(REPORT)
     write_text(path, page)
     return path
+
+
+def _weak_levels(run: MeasuredRun) -> list[str]:
+    """Return lines about levels that hardly matter; about gains only if views were held out."""
+    manifest, metrics = run.archive.manifest, run.metrics
+    gains: Sequence[float] = ()
+    if metrics["split"] == "test":
+        at_end = {int(level): figures.get(VIEW_PSNR, ()) for level, figures in metrics["levels"].items()}
+        logged = last_view_psnrs(run.archive.history(), along=False)
+        gains = smaller_gains(finest_gains(at_end), finest_gains(logged))
+    return weak_levels(manifest.records, gains, manifest.settings, advised=knows_options(manifest))
 
 
 def render_page(template: Path, **values: Any) -> str:

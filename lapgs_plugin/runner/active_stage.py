@@ -21,6 +21,7 @@ from lapgs_plugin.errors import (
     first_line,
     typed_line,
 )
+from lapgs_plugin.evaluation.metrics import means
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
@@ -326,7 +327,9 @@ class ActiveStage(RunningStage):
         """Measure the held-out views of the archived level; a failure costs no more than the measurement."""
         try:
             with self.record.after_archive("evaluation"):
-                self._measure_held_out(gaussians, self.stage.iterations)
+                views = self._measure_held_out(gaussians, self.stage.iterations)
+                if self.stage.level <= 1:
+                    self.record.write_view_psnrs([view["psnr"] for view in views], self._views.held_out_without())
         except LapgsError:  # the run folder cannot be written
             raise
         except Exception as error:
@@ -347,11 +350,13 @@ class ActiveStage(RunningStage):
             captured = self._views.render_alone(rendering, gaussians, next(iter(self._views.cameras)), black=False)
             self._context.compare(captured, field, residual_follows=self.stage.level > 0, state=state)
 
-    def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> None:
-        """Write the quality of the held-out views after an iteration to the history."""
-        quality = self._views.held_out_quality(gaussians)
+    def _measure_held_out(self, gaussians: Any, iteration: int, elapsed: float | None = None) -> list[dict[str, float]]:
+        """Write the mean quality of the held-out views after an iteration to the history, and return that of each."""
+        views = self._views.held_out_qualities(gaussians)
+        quality = means(views)
         self.record.write_history(iteration, {**({} if elapsed is None else {"elapsed": elapsed}), **quality})
-        logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._views.test))
+        logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(views))
+        return views
 
     def _result(self, gaussians: Any, field: GaussianField, carried: Any, moments: Any) -> StageResult:
         predictions = None

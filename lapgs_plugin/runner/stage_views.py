@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.level_views import PrefetchingViews
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.evaluation.metrics import psnr, qualities
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.runner.context import TrainingRun
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
@@ -103,13 +103,22 @@ class StageViews:
         return predictions
 
     @torch.no_grad()
-    def held_out_quality(self, gaussians: Any) -> dict[str, float]:
-        """Return means of PSNR in dB and SSIM over the held-out views, upsampled, inside of their masks."""
-        run, level, photos = self._run, self._stage.level, self._context.images
-        return mean_quality(
-            run.beside_photo(level, self._composed(gaussians, key), photos[key].load(run.device), photos.mask(key))
-            for key in self.test
+    def held_out_qualities(self, gaussians: Any) -> list[dict[str, float]]:
+        """Return PSNR in dB and SSIM of each held-out view, upsampled, inside of its mask."""
+        return qualities(self._beside_photo(key, self._composed(gaussians, key)) for key in self.test)
+
+    @torch.no_grad()
+    def held_out_without(self) -> list[float]:
+        """Return the PSNR in dB of each held-out view without the level; empty unless it is a residual."""
+        predictions = self.images.predictions
+        return (
+            [] if predictions is None else [psnr(*self._beside_photo(key, predictions.get(key))) for key in self.test]
         )
+
+    def _beside_photo(self, key: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return an image (3, h, w) of the level at full size, the view's photo and its mask."""
+        run, photos = self._run, self._context.images
+        return run.beside_photo(self._stage.level, image, photos[key].load(run.device), photos.mask(key))
 
     def render_alone(self, rendering: StageRendering, gaussians: Any, key: str, *, black: bool = True) -> Captured:
         """Render a view; `rendering` replaces the stage's, `black` the call's background."""

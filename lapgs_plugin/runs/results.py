@@ -28,6 +28,8 @@ class HistoryEntry(StrictWithMore):
     sampled_fitted_psnr: NotRequired[float]
     ssim: NotRequired[float]
     num_gaussians: NotRequired[NonNegativeInt]
+    view_psnr: NotRequired[list[float]]
+    coarser_view_psnr: NotRequired[list[float]]
 
 
 class _Distances(StrictWithMore):
@@ -53,6 +55,8 @@ class MetricsOfLevel(StrictWithMore):
 
     psnr: float
     upsampled_psnr: float
+    view_psnr: NotRequired[list[float]]
+    start_gaussians: NotRequired[NonNegativeInt | None]
     iterations: PositiveInt
     image_size: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
     train_seconds: NonNegativeFloat

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean, stdev
 from typing import Any
 
 from lapgs_plugin.runs.manifest import LevelRecord
@@ -14,35 +15,97 @@ from lapgs_plugin.runs.manifest import LevelRecord
 FEW_LEFT = 0.1
 """Share of the Gaussians that a level started with, below which its end is reported."""
 SMALL_GAIN = 0.1
-"""Decibels that the finest level should add to the PSNR of whole images."""
+"""Decibels that the finest level should add to the PSNR of held-out images."""
+LEAST_VIEWS = 4
+"""Fewest held-out views whose gains say whether a level matters."""
+LEAST_ITERATIONS = 500
+"""Fewest iterations of a finest level that should change images."""
+VIEW_PSNR, COARSER_VIEW_PSNR = "view_psnr", "coarser_view_psnr"
+"""Keys of the history and of metrics.json: PSNR in dB of each held-out view at full size, in the scene's order; the
+second without the level, by the coarser levels as they are when it ends."""
 
 
-def weak_levels(records: Sequence[LevelRecord], psnr: Mapping[int, float], views: str = "held-out") -> list[str]:
+def weak_levels(
+    records: Sequence[LevelRecord], gains: Sequence[float], settings: Mapping[str, Any], *, advised: bool = True
+) -> list[str]:
     """Return a line for each level that lost nearly all of its Gaussians, and one if the finest hardly matters.
+
+    The second compares the mean gain and its standard error with `SMALL_GAIN`, because gains differ between views.
+    Levels that `--prune` made small are not named.
 
     Args:
         records: of finished levels.
-        psnr: of whole images after each level, in dB, as far as it was measured.
-        views: which views were measured.
+        gains: decibels that the finest level adds to the PSNR of each held-out view; empty if that was not measured.
+        settings: of the run's manifest.
+        advised: whether lines name options of `lapgs train` and `lapgs run`.
     """
-    lines = [
-        f"level {record.level} ended with {record.num_gaussians:,} of the {record.start_gaussians:,} Gaussians that it "
-        "started with: hardly any of its detail is in the image; compare with fewer levels or the other hierarchy"
-        for record in records
-        if record.start_gaussians is not None and record.num_gaussians < FEW_LEFT * record.start_gaussians
-    ]
-    if psnr.keys() >= {0, 1} and (gain := psnr[0] - psnr[1]) < SMALL_GAIN:
-        lines.append(
-            f"level 0 changes the PSNR of {views} images by {gain:+.2f} dB, from {psnr[1]:.2f} to {psnr[0]:.2f}: by "
-            "this measure it adds little to the coarser level's, enlarged; compare their LPIPS, fewer levels or the "
-            "other hierarchy"
-        )
+    pruned = bool(settings.get("prune"))
+    died = [record for record in records if not pruned and _lost_nearly_all(record)]
+    lines = [_died_line(record, advised) for record in died]
+    finest = records[-1] if records else None
+    if finest is not None and finest.level == 0 and finest.iterations >= LEAST_ITERATIONS and finest not in died:
+        mean, error = _mean_and_error(gains)
+        if mean + error < SMALL_GAIN:
+            lines.append(
+                f"level 0 changes the PSNR of {len(gains)} held-out images by {mean:+.2f} dB: by this measure it adds "
+                f"little to the coarser level's, enlarged; compare LPIPS with {_instead(finest.signed, advised)}"
+            )
     return lines
 
 
-def last_psnr(history: Iterable[Mapping[str, Any]]) -> dict[int, float]:
-    """Return the last PSNR of all held-out views by level, from the entries of a run's history."""
-    return {entry["level"]: entry["psnr"] for entry in history if "psnr" in entry}
+def finest_gains(psnrs: Mapping[int, Sequence[float]]) -> list[float]:
+    """Return the decibels that level 0 adds to each view, from the views' PSNR by level; empty if they do not match."""
+    fine, coarse = psnrs.get(0, ()), psnrs.get(1, ())
+    return [ours - without for ours, without in zip(fine, coarse, strict=True)] if len(fine) == len(coarse) else []
+
+
+def smaller_gains(*gains: Sequence[float]) -> Sequence[float]:
+    """Return those gains that have the smaller mean; empty if all are."""
+    return min(filter(None, gains), key=fmean, default=())
+
+
+def last_view_psnrs(history: Iterable[Mapping[str, Any]], *, along: bool) -> dict[int, list[float]]:
+    """Return the last PSNR of each held-out view by level, from the entries of a run's history.
+
+    Args:
+        along: whether figures of level 1 are those at the end of level 0, with which it may have trained along, instead
+            of those at its own end.
+    """
+    psnrs: dict[int, list[float]] = {}
+    for entry in history:
+        if VIEW_PSNR in entry:
+            psnrs[entry["level"]] = entry[VIEW_PSNR]
+        if along and COARSER_VIEW_PSNR in entry:
+            psnrs[entry["level"] + 1] = entry[COARSER_VIEW_PSNR]
+    return psnrs
+
+
+def _lost_nearly_all(record: LevelRecord) -> bool:
+    return record.start_gaussians is not None and record.num_gaussians < FEW_LEFT * record.start_gaussians
+
+
+def _died_line(record: LevelRecord, advised: bool) -> str:
+    text = (
+        f"level {record.level} ended with {record.num_gaussians:,} of the {record.start_gaussians:,} Gaussians that it "
+        "started with: "
+    )
+    if record.signed:
+        return f"{text}hardly any of its detail is in the image; compare with {_instead(True, advised)}"
+    return f"{text}its images may lack detail; check that the points and the cameras are of one model"
+
+
+def _instead(signed: bool, advised: bool) -> str:
+    """Return what a user may try instead of a finest level that brings little."""
+    if not advised:
+        return "fewer levels, the other hierarchy or more photos"
+    return "--hierarchy nested, --levels 1 or more photos" if signed else "--levels 1 or more photos"
+
+
+def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+    """Return the mean of some values and its standard error, which is infinite for fewer than `LEAST_VIEWS`."""
+    if len(values) < LEAST_VIEWS:
+        return 0.0, math.inf
+    return fmean(values), stdev(values) / math.sqrt(len(values))
 
 
 def training_figures(records: Sequence[LevelRecord]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +16,14 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import GpuBusy
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.profiling import Breakdown, Overhead, PeakMemory
-from lapgs_plugin.runs.training_figures import last_psnr, weak_levels
+from lapgs_plugin.runs.training_figures import (
+    COARSER_VIEW_PSNR,
+    VIEW_PSNR,
+    finest_gains,
+    last_view_psnrs,
+    smaller_gains,
+    weak_levels,
+)
 
 HISTORY_ENTRIES = 200
 """Approximate number of history entries of a run, without those of held-out views."""
@@ -186,6 +193,16 @@ class StageRecord(LoopRecord):
         """Add figures of an iteration to the history."""
         self.archive.append_history({"level": self.stage.level, "iteration": iteration, **values})
 
+    def write_view_psnrs(self, psnrs: Sequence[float], coarser: Sequence[float] = ()) -> None:
+        """Add the PSNR in dB of the held-out views at the stage's end to the history.
+
+        Args:
+            psnrs: of whole images at full size, one for each view.
+            coarser: the same of the coarser levels' images alone, if the level is added to them.
+        """
+        figures = {VIEW_PSNR: list(psnrs), **({COARSER_VIEW_PSNR: list(coarser)} if coarser else {})}
+        self.write_history(self.stage.iterations, figures)
+
     def elapsed_in_run(self) -> float:
         """Return the seconds of optimization since the start of the run."""
         records = self.archive.manifest.records
@@ -212,8 +229,9 @@ class StageRecord(LoopRecord):
 
     def weak_lines(self) -> list[str]:
         """Return a line for the user for each sign that the level that was archived last hardly matters."""
-        psnr = last_psnr(self.archive.history()) if self.stage.level == 0 else {}
-        return weak_levels(self.archive.manifest.records[-1:], psnr)
+        manifest = self.archive.manifest
+        gains = [finest_gains(last_view_psnrs(self.archive.history(), along=along)) for along in (True, False)]
+        return weak_levels(manifest.records[-1:], smaller_gains(*gains), manifest.settings)
 
     @contextmanager
     def after_archive(self, purpose: str) -> Iterator[None]:

@@ -21,6 +21,21 @@ from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatc
 from lapgs_plugin.training.stage import StageRun
 
 
+@dataclass(frozen=True)
+class ViewPsnr:
+    """Hold the PSNR in dB of a view, upsampled to full size.
+
+    Attributes:
+        plain: of the composed image.
+        fitted: the same after a colour fit.
+        coarser: of the coarser levels' image without the running residual; None if no residual runs.
+    """
+
+    plain: float
+    fitted: float
+    coarser: float | None
+
+
 @dataclass
 class StageEvaluation:
     """Measure views of a stage, composed so far and upsampled to full resolution.
@@ -36,6 +51,7 @@ class StageEvaluation:
     watch: QualityWatch
     monitor: Monitor
     best: dict[str, Any] | None = None
+    _last: tuple[int, list[ViewPsnr]] | None = None  # iteration and figures of all held-out views
 
     def held_out(self, every: bool, sample: bool) -> dict[str, float]:
         """Return the PSNR fields of a `Tick`: of every held-out view, of some, or of both; empty without such views."""
@@ -48,15 +64,30 @@ class StageEvaluation:
             learned = None if run.exposures is None else run.exposures.archived()
             exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
             psnrs = {view.name: self._psnr(view, exposures.get(view.name)) for view in views}
-        measured = {"psnr": fmean(plain for plain, _ in psnrs.values())} if every else {}
+        measured = {"psnr": fmean(each.plain for each in psnrs.values())} if every else {}
+        if every:
+            self._last = run.counts.iteration, list(psnrs.values())
         if some:
-            plain, fitted = zip(*(psnrs[view.name] for view in some), strict=True)
-            measured |= {"sampled_psnr": fmean(plain), "sampled_fitted_psnr": fmean(fitted)}
+            sampled = [psnrs[view.name] for view in some]
+            measured["sampled_psnr"] = fmean(each.plain for each in sampled)
+            measured["sampled_fitted_psnr"] = fmean(each.fitted for each in sampled)
         return measured
 
+    def note_views(self) -> None:
+        """Write the PSNR of each held-out view, in the state that is archived, to the history if it can be of use."""
+        run = self.run
+        if not run.prepared.scene.test or run.stage.level > 1:
+            return
+        if self._last is None or self._last[0] != run.stage.iterations:
+            self.held_out(every=True, sample=False)
+        assert self._last is not None, "`held_out` sets it"
+        views = self._last[1]
+        coarser = [each.coarser for each in views if each.coarser is not None]
+        run.record.write_view_psnrs([each.plain for each in views], coarser)
+
     @torch.no_grad()
-    def _psnr(self, view: View, exposure: Tensor | None = None) -> tuple[float, float]:
-        """Return the PSNR in dB of a view, and after a colour fit.
+    def _psnr(self, view: View, exposure: Tensor | None = None) -> ViewPsnr:
+        """Measure a view.
 
         Args:
             exposure: (3, 4) colour transform from renders to the view's photo; None leaves renders unchanged.
@@ -65,11 +96,15 @@ class StageEvaluation:
         camera = level_camera(view.camera, level)
         camera = camera if run.poses is None else run.poses.camera(view.name, camera)
         image = run.prepared.rasterizer(run.model.field, camera, background=run.background).image
-        image = add_prediction(image, None if below is None else below.get(view.name))
-        whole, photo, mask = run.prepared.beside_photo(level, image, view.image, view.mask)
-        if exposure is not None:
-            whole = transform_colors(whole, exposure.to(whole.device))
-        return psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask)
+        coarser = None if below is None else below.get(view.name)
+        whole, photo, mask = self._beside_photo(view, add_prediction(image, coarser), exposure)
+        without = None if coarser is None else psnr(*self._beside_photo(view, coarser, exposure))
+        return ViewPsnr(psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask), without)
+
+    def _beside_photo(self, view: View, image: Tensor, exposure: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return an image (3, h, w) of the level at full size with a photo's exposure, the photo and its mask."""
+        whole, photo, mask = self.run.prepared.beside_photo(self.run.stage.level, image, view.image, view.mask)
+        return whole if exposure is None else transform_colors(whole, exposure.to(whole.device)), photo, mask
 
     def warn_of_a_fall(self, measured: Mapping[str, float]) -> None:
         """Tell the user if held-out views got worse while the training loss fell."""
@@ -92,7 +127,8 @@ class StageEvaluation:
         last = iteration == run.stage.iterations
         with run.record.overhead.timed("evaluation"):
             fitted = run.exposures is not None
-            now = fmean(self._psnr(view)[fitted] for view in aside)
+            psnrs = [self._psnr(view) for view in aside]
+            now = fmean(each.fitted if fitted else each.plain for each in psnrs)
             if self.best is None or now > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
                 state = run.state()
                 parts = {name: copied(state[name]) for name in ("model", "joint", *run.transforms)}
@@ -114,3 +150,4 @@ class StageEvaluation:
         if best["joint"] is not None:
             run.train_jointly(best["joint"])
         run.restore_transforms(best)
+        self._last = None

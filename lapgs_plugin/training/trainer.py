@@ -183,6 +183,7 @@ class Trainer:
             run.run(between_steps)
             run.hooks.on_stage_end(run.stage)
             evaluation.return_to_best()
+            evaluation.note_views()
             record.note_memory(images.bytes_on_device)
             self._archive_stage(run, extends=before is not None)
             self.watcher.stage_finished(run.stage, lambda: run.fields)

@@ -154,7 +154,7 @@ def test_an_evaluation_that_fails_costs_no_run(
         assert RunArchive.open(tmp_path / "run").manifest.complete, "archived before"
         raise RuntimeError("no image\nat all")
 
-    monkeypatch.setattr(StageViews, "held_out_quality", broken)
+    monkeypatch.setattr(StageViews, "held_out_qualities", broken)
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT) as adapter:
         drive(adapter, levels=1)
     assert RunArchive.open(tmp_path / "run").field(0).means.isfinite().all()

@@ -23,7 +23,9 @@ from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runner.splats import on_cpu
 from lapgs_plugin.runner.splats.on_cpu import rasterization_on_cpu
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs
 from lapgs_plugin.scenes.scene import load_scene
+from tests.training_runs import rendered_gains
 
 SCRIPT = Path(__file__).parent / "checkouts" / "simple_trainer" / "simple_trainer.py"
 SHORT = ("--max_steps", 30, "--eval_steps", 30, "--save_steps", 30, "--strategy.refine_stop_iter", 20)
@@ -110,6 +112,8 @@ def test_levels_are_archived(finished: Path) -> None:
     assert found == [(1, (32, 24), 10, False), (0, (64, 48), 20, signed)]
     assert [archive.field(level).signed for level in (1, 0)] == [False, signed]
     assert {entry["level"] for entry in archive.history() if "psnr" in entry} == {0, 1}
+    gains = finest_gains(last_view_psnrs(archive.history(), along=True))
+    assert gains == pytest.approx(rendered_gains(archive, run_scene(archive).test), abs=1e-3)  # 1e-7 seen
 
 
 def test_the_run_folder_shows_what_the_script_measured(finished: Path) -> None:

@@ -22,6 +22,7 @@ from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.hierarchy.settings import Hierarchy
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.reference_raster.oracle import world_covariances
+from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training import mcmc
 from lapgs_plugin.training.mcmc import MOST_COPIES, McmcDensifier, bound_sizes, copies_of, shake
 from lapgs_plugin.training.model import TrainableField
@@ -300,6 +301,31 @@ def test_a_residual_under_pressure_keeps_gaussians(tmp_path: Path) -> None:
     residual = train(tmp_path / "run", ring_scene(), settings).manifest.records[-1]
     assert residual.start_gaussians == 600
     assert residual.num_gaussians > 30  # 81 seen, 7 before
+
+
+@pytest.mark.parametrize(
+    ("weight", "least"),
+    [
+        (None, 60),  # the default: a tenth at least; 600 seen
+        (0.04, 30),  # 74 seen, 2 by a mean over those that are left
+    ],
+)
+def test_a_residual_of_a_scene_with_detail_keeps_gaussians(weight: float | None, least: int, tmp_path: Path) -> None:
+    """Of 30 views whose blobs are as small as a pixel. It starts with as many Gaussians as its limit allows."""
+    field = blob_field(1500)
+    field = replace(field, log_scales=field.log_scales - 0.8)
+    views = []
+    for index in range(30):
+        camera = ring_camera(2 * math.pi * index / 30)
+        image = CpuRasterizer()(field, camera, background=torch.zeros(3)).image
+        views.append(View(f"view_{index}.png", camera, image.clamp(0, 1)))
+    points = field.means[::3]
+    scene = replace(ring_scene(), train=tuple(views), test=(), points=points, colors=torch.full((len(points), 3), 0.5))
+    density = Densification(MCMC, start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=weight))
+    settings = TrainSettings(iterations=400, levels=2, sh_degree=0, exposure="off", densification=density)
+    residual = train(tmp_path / "run", scene, settings).manifest.records[-1]
+    assert residual.start_gaussians == 600
+    assert residual.num_gaussians >= least
 
 
 def test_gaussians_are_added_up_to_the_limit_and_the_image_stays() -> None:

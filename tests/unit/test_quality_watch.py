@@ -13,7 +13,7 @@ from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.scenes.scene import View
-from lapgs_plugin.training.evaluation import StageEvaluation
+from lapgs_plugin.training.evaluation import StageEvaluation, ViewPsnr
 from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import (
@@ -77,9 +77,13 @@ def test_a_run_measures_some_held_out_views_during_its_stages(tmp_path: Path) ->
         assert entry["sampled_psnr"] == pytest.approx(entry["psnr"])
 
 
+def measured(psnr: float) -> ViewPsnr:
+    return ViewPsnr(psnr, psnr, None)
+
+
 def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = iter([30.0 - step for step in range(100)])
-    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: (next(values),) * 2)
+    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: measured(next(values)))
     scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
     monitor = Said()
     train(tmp_path / "run", scene, settings, monitor=monitor)
@@ -109,7 +113,7 @@ def test_keep_best_keeps_the_last_state_unless_another_one_is_visibly_better(
 ) -> None:
     samples = iter([20.0, 20.001] + [20.0 - 0.001 * step for step in range(8)])  # the second of ten is best by 0.008 dB
     values = (value for value in samples for _ in range(2))
-    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: (next(values),) * 2)
+    monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: measured(next(values)))
     scene = ring_scene(train=12, test=0)
     settings = TrainSettings(iterations=40, levels=1, sh_degree=0, exposure="off", keep="best")
     monitor = Said()
@@ -137,7 +141,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
 
-    def invented(evaluation: StageEvaluation, view: View) -> tuple[float, float]:
+    def invented(evaluation: StageEvaluation, view: View) -> ViewPsnr:
         run = evaluation.run
         assert view.name in aside
         assert run.exposures is not None
@@ -145,7 +149,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
         fields[moment] = run.model.field.means.detach().clone()
         if run.joint is not None:
             along[moment] = run.joint.fields[1].means.clone()
-        return 0.0, 20.0 + (moment in {(1, 16), (0, 36)})
+        return ViewPsnr(0.0, 20.0 + (moment in {(1, 16), (0, 36)}), None)
 
     monkeypatch.setattr(StageEvaluation, "_psnr", invented)
     names, monitor = Names(), Said()

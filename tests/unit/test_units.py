@@ -28,10 +28,8 @@ from lapgs_plugin.rendering.rig import Rig
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.reports.splat_page import write_splat_page
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runs import training_figures
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
-from lapgs_plugin.runs.training_figures import weak_levels
+from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.scene import Scene, load_scene
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.prepared_run import PreparedRun
@@ -276,40 +274,3 @@ def test_a_checkout_is_told_of_points_that_its_rasterizer_does_not_draw(
     checkout_scene(points, scale).check_points()
     lines = [record.getMessage() for record in caplog.records]
     assert [bool(re.search(named, line)) for line in lines[:1]] == [True] * bool(named)
-
-
-def record(level: int, start: int | None, end: int) -> LevelRecord:
-    return LevelRecord(level, level == 0, 10, end, 500, 1.0, {}, (8, 6), start_gaussians=start)
-
-
-@pytest.mark.parametrize(
-    ("start", "end", "psnr", "named"),
-    [
-        (500_000, 2, {}, ["level 0 ended with 2 of the 500,000 Gaussians that it started with"]),
-        (100, 10, {1: 20.0, 0: 20.11}, []),
-        (
-            100,
-            100,
-            {1: 20.0, 0: 20.09},
-            [r"PSNR of held-out images by \+0.09 dB, from 20.00 to 20.09"],
-        ),
-        (100, 100, {1: 20.0, 0: 19.5}, ["level 0 changes the PSNR of held-out images by -0.50"]),
-        (100, 9, {2: 10.0, 1: 20.0, 0: 20.0}, ["level 0 ended with 9 of the 100", r"by \+0.00 dB"]),
-        (None, 1, {0: 20.0}, []),  # not recorded, and no views of level 1
-    ],
-)
-def test_levels_that_matter_little_are_named(
-    start: int | None, end: int, psnr: dict[int, float], named: list[str]
-) -> None:
-    lines = weak_levels([record(1, 50, 60), record(0, start, end)], psnr)
-    assert len(lines) == len(named)
-    assert all(re.search(each, line) for each, line in zip(named, lines, strict=True))
-
-
-def test_weak_levels_are_lines_of_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_figures, "FEW_LEFT", 100.0)
-    monkeypatch.setattr(training_figures, "SMALL_GAIN", 100.0)
-    archive, lines = train(tmp_path / "run", ring_scene(), levels=2, split="1/2,1/2", iterations=8)
-    assert [record.start_gaussians for record in archive.manifest.records] == [100, 100]
-    named = ["level 1 ended with 100 of the 100", "level 0 ended with 100 of", "level 0 changes the PSNR of held-out"]
-    assert [any(each in line for line in lines) for each in named] == [True] * 3

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, LapgsError, TrainingDivergedError
-from lapgs_plugin.evaluation.metrics import mean_quality
+from lapgs_plugin.evaluation.metrics import means, psnr, qualities
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats, require_finite
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
@@ -110,7 +110,7 @@ class SplatStage:
         if every is not None and self.iteration > 1 and (self.iteration - 1) % every == 0 and self._run.test:
             elapsed = self._record.elapsed_in_run()
             with self._record.outside("evaluation"):
-                quality = self._held_out_quality()
+                quality = means(self._held_out_qualities())
             self._record.write_history(self.iteration - 1, {"elapsed": elapsed, **quality})
         if self.iteration == self._joint_from:
             self._train_jointly()
@@ -224,8 +224,10 @@ class SplatStage:
             write_cameras(self._run, self._refined_camera)
         if self._run.test and self.stage.level <= 1:
             with self._record.after_archive("evaluation"):
-                quality = self._held_out_quality()
+                views, without = self._held_out_qualities(), self._held_out_without()
+            quality = means(views)
             self._record.write_history(self.stage.iterations, quality)
+            self._record.write_view_psnrs([view["psnr"] for view in views], without)
             logger.info("held-out PSNR: %.2f dB over %d views", quality["psnr"], len(self._run.test))
         for line in self._record.weak_lines():
             logger.warning("%s", line)
@@ -242,13 +244,23 @@ class SplatStage:
             self._predictions = None
 
     @torch.no_grad()
-    def _held_out_quality(self) -> dict[str, float]:
-        """Return means of PSNR in dB and SSIM over the held-out views, upsampled."""
-        device, level = self._run.device, self.stage.level
-        return mean_quality(
-            (to_full_size(self._render(view).contiguous(), view.size, level, self._pyramid), view.image(device))
-            for view in self._run.test
-        )
+    def _held_out_qualities(self) -> list[dict[str, float]]:
+        """Return PSNR in dB and SSIM of each held-out view, upsampled."""
+        return qualities(self._beside_photo(view, self._render(view)) for view in self._run.test)
+
+    @torch.no_grad()
+    def _held_out_without(self) -> list[float]:
+        """Return the PSNR in dB of each held-out view without the level; empty unless it is a residual."""
+        coarser = self._coarser
+        if coarser is None:
+            return []
+        images = ((view, coarser.predict(self._camera_inputs(view))[0].permute(2, 0, 1)) for view in self._run.test)
+        return [psnr(*self._beside_photo(view, image)) for view, image in images]
+
+    def _beside_photo(self, view: SplatView, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return an image (3, h, w) of the level at full size, and the view's photo."""
+        whole = to_full_size(image.contiguous(), view.size, self.stage.level, self._pyramid)
+        return whole, view.image(self._run.device)
 
     def _refined_camera(self, index: int) -> Camera:
         """Return the camera of a training view at the pose that the script has learned."""
