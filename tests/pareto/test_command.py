@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import subprocess
 import sys
@@ -62,14 +61,11 @@ def copy_without_iterations(checkout: Path, copy: Path) -> None:
         target.write_text(file.read_text().replace("iterations", "rounds"))
 
 
-def test_a_scene_that_is_missing_or_has_no_held_out_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_that_is_missing_or_has_no_views_to_hold_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     _refused(["nowhere"], "nowhere is not a folder; expected a scene")
-    write_scene(tmp_path / "scene")
-    file = tmp_path / "scene/transforms.json"
-    values = json.loads(file.read_text())
-    file.write_text(json.dumps({**values, "train_filenames": [frame["file_path"] for frame in values["frames"]]}))
-    _refused(["scene"], "has no views to hold out")
+    write_scene(tmp_path / "scene", ["only.png"])
+    _refused(["scene"], "scene: 0 training views besides 1 held out, expected at least 2")
 
 
 def _refused(words: list[str], expected: str) -> None:
