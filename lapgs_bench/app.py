@@ -66,7 +66,7 @@ def pareto(
 
         lapgs bench pareto data/garden --budgets 5,10,20,40
 
-        lapgs bench pareto data/garden --checkout FastGS --checkout-options '--mult 0.7'
+        lapgs bench pareto data/garden --checkout FastGS --seeds 0,1
     """
     from lapgs_bench.pareto.command import draw_pareto
 

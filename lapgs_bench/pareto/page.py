@@ -173,7 +173,7 @@ def write_results(curves: Curves, folder: Path) -> None:
         ratios=curves.ratio_lines(),
         metrics=curves.metrics,
         best=curves.best_lines(),
-        late=f"{LATE:.0%}",
+        late=f"{100 * LATE:g} %",
         rows=rows,
         lpips=curves.lpips,
         failures=curves.failures,
