@@ -59,11 +59,13 @@ class Bench:
         runs = [self._run(method, WARM_UP, first, evaluated=False)]
         rows: list[Row] = []
         for budget in self.settings.budgets:
-            runs.append(self._run(method, planned_iterations(budget, runs), first))
-            missed = abs(runs[-1]["train_seconds"] / budget - 1) > MISSED
-            if missed and (again := planned_iterations(budget, runs)) != runs[-1]["iterations"]:
-                runs.append(self._run(method, again, first))
-            of_seeds = [runs[-1], *(self._run(method, runs[-1]["iterations"], seed) for seed in others)]
+            tried = [self._run(method, planned_iterations(budget, runs), first)]
+            if _miss(tried[0], budget) > MISSED:
+                again = planned_iterations(budget, [*runs, *tried])
+                tried += [self._run(method, again, first)] if again != tried[0]["iterations"] else []
+            runs += tried
+            nearest = min(tried, key=lambda run: _miss(run, budget))
+            of_seeds = [nearest, *(self._run(method, nearest["iterations"], seed) for seed in others)]
             rows += [{**run, "curve": method.name, "budget": budget} for run in of_seeds]
         return rows
 
@@ -110,6 +112,12 @@ def planned_iterations(budget: float, runs: Sequence[Row]) -> int:
         if rate > 0 and 0 <= seconds - rate * count < budget:
             planned = count + (budget - seconds) / rate
     return max(LEAST, round(min(planned, FARTHEST * proportional)))
+
+
+def _miss(run: Row, budget: float) -> float:
+    """Return by which share of a budget a run missed it."""
+    seconds: float = run["train_seconds"]
+    return abs(seconds / budget - 1)
 
 
 def _length(run: Row) -> tuple[int, float]:

@@ -81,7 +81,7 @@ def test_a_comparison_from_end_to_end(tmp_path: Path) -> None:
     """Of `lapgs train` and a checkout; the second command trains nothing."""
     lapgs = [sys.executable, "-m", "lapgs_plugin"]
     scene = [*lapgs, "sample", "scene", "--size", "96x64", "--views", "9", "--points", "300"]
-    compare = [*lapgs, "bench", "pareto", "scene", "--budgets", "1,6", "-o", "out", "--device", "cpu"]
+    compare = [*lapgs, "bench", "pareto", "scene", "--budgets", "6", "-o", "out", "--device", "cpu"]
     compare += ["--checkout", str(STUB), "--checkout-options", "--disable_viewer"]
     outputs = []
     for command in (scene, compare, compare):
@@ -94,7 +94,7 @@ def test_a_comparison_from_end_to_end(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     methods = ["one field", "nested", "laplacian"]
     methods += [f"{STUB.name}, {kind}" for kind in ("own script", "nested", "laplacian")]
-    assert [(row["method"], row["budget"]) for row in rows] == [(m, b) for m in methods for b in ("1.0", "6.0")]
+    assert [(row["method"], row["budget"]) for row in rows] == [(method, "6.0") for method in methods]
     assert all(float(row["psnr"]) > 10 and float(row["psnr_fit"]) > 10 and row["gaussians"] for row in rows)
     fastest = min(rows, key=lambda row: float(row["seconds"]))
     assert fastest["front"] == "psnr_fit psnr ssim"
