@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from lapgs_bench.experiments.settings import BenchSettings
 from lapgs_bench.kernels.commands import blend, ops, raster
+from lapgs_bench.pareto.settings import ParetoSettings
 from lapgs_plugin.cli.bridge import takes_settings
 
 EXPERIMENT = "run"
@@ -51,6 +52,27 @@ def experiment(
     run_experiment(experiment, settings)
 
 
+@takes_settings
+def pareto(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder.")],
+    settings: ParetoSettings,
+) -> None:
+    """Compare methods at equal time: train SCENE for several budgets of seconds, and draw quality over seconds.
+
+    One field, nested levels and residuals of `lapgs train`; with --checkout also a checkout's script, by itself and
+    under `lapgs run`. Repeat the command to continue after Ctrl-C; finished runs are kept.
+
+    Examples:
+
+        lapgs bench pareto data/garden --budgets 5,10,20,40
+
+        lapgs bench pareto data/garden --checkout FastGS --seeds 0,1
+    """
+    from lapgs_bench.pareto.command import draw_pareto
+
+    draw_pareto(scene, settings)
+
+
 app = typer.Typer(
     name="bench",
     cls=_ExperimentByDefault,
@@ -62,3 +84,4 @@ app.command(EXPERIMENT)(experiment)
 app.command("raster")(raster)
 app.command("ops")(ops)
 app.command("blend")(blend)
+app.command("pareto")(pareto)

@@ -101,10 +101,10 @@ class _Check(Rehearsal):
 
     def run(self, settings: RunSettings, arguments: Sequence[str]) -> None:
         assert self.size is not None, "commands of a checkout need a scene"
-        if self.spec.method == "bare" or _sets(self.spec.arguments, "--iterations"):
+        if self.spec.method == "bare" or sets_option(self.spec.arguments, "--iterations"):
             return
         known = None
-        if not _sets(self.spec.arguments, "-r", "--resolution"):
+        if not sets_option(self.spec.arguments, "-r", "--resolution"):
             # The script may read scenes that we cannot read.
             with suppress(SceneError):
                 known = self.size(BACKBONE_PREFIX + arguments[list(arguments).index("-r") + 1])
@@ -162,13 +162,14 @@ def _check_arguments(spec: RunSpec) -> None:
     for word in spec.arguments:
         if "\0" in word:
             raise UserInputError(f"arguments {word!r}: expected no NUL, which no command line can hold")
-        if _sets([word], *OWN_ARGUMENTS):
+        if sets_option([word], *OWN_ARGUMENTS):
             raise UserInputError(
                 f"arguments {word!r}: the experiment sets output folder and scene; expected other options of the script"
             )
 
 
-def _sets(arguments: Sequence[str], *options: str) -> bool:
+def sets_option(arguments: Sequence[str], *options: str) -> bool:
+    """Tell whether arguments of a script set any of these options."""
     return any(word == option or word.startswith(f"{option}=") for word in arguments for option in options)
 
 

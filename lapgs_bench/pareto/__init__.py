@@ -1,0 +1,1 @@
+"""Draw quality over seconds: `lapgs bench pareto`."""
