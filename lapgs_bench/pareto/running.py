@@ -22,7 +22,7 @@ LEAST = 20
 """Fewest iterations of a run."""
 MISSED = 0.25
 """Share of a budget by which a run may miss it; else it is planned once more."""
-FARTHEST = 4.0
+FARTHEST = 2.0
 """Most iterations of a run, as a factor on those by a rate alone: on a busy machine two runs say little."""
 
 Say = Callable[[str], None]

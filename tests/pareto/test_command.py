@@ -76,7 +76,7 @@ def _refused(words: list[str], expected: str) -> None:
     assert expected in str(result.exception)
 
 
-@pytest.mark.slow  # a minute of starting processes
+@pytest.mark.slow  # minutes of starting processes
 def test_a_comparison_from_end_to_end(tmp_path: Path) -> None:
     """Of `lapgs train` and a checkout; the second command trains nothing."""
     lapgs = [sys.executable, "-m", "lapgs_plugin"]
@@ -99,7 +99,7 @@ def test_a_comparison_from_end_to_end(tmp_path: Path) -> None:
     fastest = min(rows, key=lambda row: float(row["seconds"]))
     assert fastest["front"] == "psnr_fit psnr ssim"
     assert " took " not in outputs[2]
-    assert outputs[1].splitlines()[-10:] == outputs[2].splitlines()[-10:]  # the same readings
+    assert outputs[1].splitlines()[-5:] == outputs[2].splitlines()[-5:]  # readings of three metrics and one budget
     page = (tmp_path / "out/pareto.html").read_text()
     assert all(method in page for method in methods)
     svg = ElementTree.parse(tmp_path / "out/pareto.svg").getroot()

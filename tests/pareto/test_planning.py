@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from lapgs_bench.pareto.running import LEAST, planned_iterations
+from lapgs_bench.pareto.running import FARTHEST, LEAST, planned_iterations
 
 
 def run_of(iterations: int, start: float, rate: float) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def test_two_runs_tell_start_and_rate(counts: list[int], rate: float, start: flo
     budget = longer * runs[-1]["train_seconds"]
     iterations = planned_iterations(budget, runs)
     proportional = budget * counts[-1] / runs[-1]["train_seconds"]
-    assume(iterations < round(4 * proportional))  # bounded: two noisy runs must not plan a run without end
+    assume(iterations < round(FARTHEST * proportional))  # bounded: two noisy runs must not plan a run without end
     assert start + rate * iterations == pytest.approx(budget, abs=0.51 * rate + 1e-6)  # rounded to an iteration
 
 
