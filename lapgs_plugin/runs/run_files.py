@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,20 @@ class RunFiles:
         path = self.path(HISTORY)
         return read_json_lines(path, HistoryEntry, error=RunFolderError) if exists(path) else []
 
+    def complete_history(self, entry: dict[str, Any]) -> None:
+        """Add values to the last entry if it has the same level and iteration, else append them as an entry.
+
+        Args:
+            entry: as `append_history` takes it.
+        """
+        last = (self.history() or [{}])[-1]
+        if (last.get("level"), last.get("iteration")) != (entry["level"], entry["iteration"]):
+            self.append_history(entry)
+            return
+        self._require_lock()
+        checked(entry, HistoryEntry, "the history entry", advice="it could not be read again")
+        self._write_history([*self.history()[:-1], last | entry])
+
     def rewind_history(self, level: int, iteration: int) -> None:
         """Remove the entries after an iteration of a level, which a resumed run adds again.
 
@@ -108,7 +123,10 @@ class RunFiles:
         """
         self._require_lock()
         kept = [entry for entry in self.history() if (-entry["level"], entry["iteration"]) <= (-level, iteration)]
-        text = "".join(json.dumps(entry) + "\n" for entry in kept)
+        self._write_history(kept)
+
+    def _write_history(self, entries: Iterable[Mapping[str, Any]]) -> None:
+        text = "".join(json.dumps(entry, allow_nan=False) + "\n" for entry in entries)
         write_text(self.path(HISTORY), text, training=True)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:

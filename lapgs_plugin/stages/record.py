@@ -194,14 +194,14 @@ class StageRecord(LoopRecord):
         self.archive.append_history({"level": self.stage.level, "iteration": iteration, **values})
 
     def write_view_psnrs(self, psnrs: Sequence[float], coarser: Sequence[float] = ()) -> None:
-        """Add the PSNR in dB of the held-out views at the stage's end to the history.
+        """Add the PSNR in dB of the held-out views at the stage's end to its last entry in the history.
 
         Args:
             psnrs: of whole images at full size, one for each view.
             coarser: the same of the coarser levels' images alone, if the level is added to them.
         """
         figures = {VIEW_PSNR: list(psnrs), **({COARSER_VIEW_PSNR: list(coarser)} if coarser else {})}
-        self.write_history(self.stage.iterations, figures)
+        self.archive.complete_history({"level": self.stage.level, "iteration": self.stage.iterations, **figures})
 
     def elapsed_in_run(self) -> float:
         """Return the seconds of optimization since the start of the run."""
