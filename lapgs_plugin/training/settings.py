@@ -33,6 +33,9 @@ views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
 
+DECAY = 0.2
+"""Default of --decay."""
+
 LAST, BEST = "last", "best"
 """Choices of --keep."""
 ON, OFF = "on", "off"
@@ -109,7 +112,7 @@ class Densification:
     until: int | None = option(
         None,
         "Iteration of the run at which densification ends; each stage stops at the same share of its own iterations. "
-        "Default: 25000 of 30000 with --strategy mcmc, else 15000.",
+        "Default: with --strategy mcmc when the decay begins, see --decay; else 15000 of 30000.",
         panel=PANEL,
         names=("--densify-until",),
         least=0,
@@ -176,6 +179,12 @@ class TrainSettings(HierarchySettings):
         "count views.",
         panel=SCHEDULE,
     )
+    decay: float = option(
+        DECAY,
+        "Share of each stage, at its end, in which the step size of positions falls to a hundredth; before that it is "
+        "constant. 1 lets it fall from the first iteration on, as 3DGS and the paper do.",
+        panel=SCHEDULE,
+    )
     sh_degree: int = option(3, "Highest SH degree, 0 to 3.", panel=SCHEDULE)
     base_sh_degree: int | None = option(
         None,
@@ -185,8 +194,8 @@ class TrainSettings(HierarchySettings):
     sh_rate_factor: float | None = option(
         None,
         "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in all levels but "
-        "residuals. It falls exponentially to 1 within each stage. Default: the number of training views divided by "
-        f"{SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
+        "residuals. It falls exponentially to 1 in each stage's decay. Default: the number of training views divided "
+        f"by {SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
     dropout: float | None = option(
@@ -242,6 +251,8 @@ class TrainSettings(HierarchySettings):
         _ = self.asked_views
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
+        if not 0.0 < self.decay <= 1.0:
+            raise UserInputError(f"--decay {self.decay}: expected a share of each stage above 0 and at most 1")
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
             raise UserInputError(f"--dropout {self.dropout}: expected a share from 0 to below 1, such as 0.2")
         if not 0.0 <= self.ssim_weight <= 1.0:
@@ -412,6 +423,7 @@ class TrainSettings(HierarchySettings):
                 "accumulate_views": 1,
                 "views_per_step": "1",
                 "sh_rate_factor": 1.0,
+                "decay": 1.0,
                 "exposure": OFF,
                 "refine_poses": False,
             },

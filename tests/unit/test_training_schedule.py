@@ -50,10 +50,40 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
     (schedule,) = schedules(levels=1)
     assert (schedule.densify_start, schedule.densify_until) == (500, 15_000)
     assert (schedule.densify_every, schedule.reset_every, schedule.sh_every) == (100, 3000, 1000)
-    assert schedule.means_learning_rate(0) == pytest.approx(1.6e-4)
-    assert schedule.means_learning_rate(15_000) == pytest.approx(1.6e-5)  # log-linear: the geometric mean half way
+    assert [schedule.means_learning_rate(i) for i in (0, 15_000, 24_000)] == pytest.approx([1.6e-4] * 3)
+    assert schedule.means_learning_rate(27_000) == pytest.approx(1.6e-5)  # half of the decay: the geometric mean
     assert schedule.means_learning_rate(30_000) == pytest.approx(1.6e-6)
     assert [schedule.active_sh_degree(i) for i in (1, 999, 1000, 2999, 3000, 30_000)] == [0, 0, 1, 2, 3, 3]
+
+
+@given(st.integers(1, 30_000), st.integers(0, 30_000), st.floats(0.01, 1.0))
+def test_until_its_decay_a_stage_is_like_a_longer_one(iterations: int, more: int, decay: float) -> None:
+    """So one run gives the curve of all lengths. In the decay rates fall to 3DGS's last ones."""
+    (short,), (long,) = (schedules(levels=1, iterations=n, decay=decay) for n in (iterations, iterations + more))
+    rates = [short.means_learning_rate(i) for i in range(short.decay_from, iterations + 1)]
+    assert {short.means_learning_rate(i) for i in (0, short.decay_from)} == {long.means_learning_rate(0)}
+    assert long.means_learning_rate(short.decay_from) == rates[0] == pytest.approx(1.6e-4)
+    assert all(later < earlier for earlier, later in zip(rates, rates[1:], strict=False))
+    assert rates[-1] == pytest.approx(1.6e-6)
+    assert 0 <= short.decay_from < iterations
+
+
+def test_the_papers_rates_fall_from_the_first_iteration_on() -> None:
+    settings = TrainSettings(protocol="paper")
+    for stage in StagePlan.create((1600, 1066), 30_000, 2, settings.shares, settings.kind):
+        schedule, n = StageSchedule.create(settings, stage), stage.iterations
+        expected = [1.6e-4 * 100 ** (-i / n) for i in (0, 1, n // 2, n)]
+        assert [schedule.means_learning_rate(i) for i in (0, 1, n // 2, n)] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("decay", "until", "ends"), [(0.2, None, 24_000), (0.1, None, 27_000), (1.0, None, 15_000), (0.2, 7000, 7000)]
+)
+def test_mcmc_refines_until_the_decay(decay: float, until: int | None, ends: int) -> None:
+    """A decay that begins at once leaves it the half that 3DGS has."""
+    settings = TrainSettings(levels=1, decay=decay, densification=Densification(strategy="mcmc", until=until))
+    (stage,) = StagePlan.create((1600, 1066), 30_000, 1)
+    assert StageSchedule.create(settings, stage).densify_until == ends
 
 
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
@@ -203,8 +233,8 @@ def test_the_rate_of_higher_harmonics_follows_the_views_and_falls(
     settings = TrainSettings(hierarchy="laplacian", sh_rate_factor=given)
     plan = StagePlan.create((1600, 1066), 30_000, 2, settings.shares, settings.kind)
     base, residual = (StageSchedule.create(settings, stage, training_views=views) for stage in plan)
-    assert (base.sh_rest_factor_at(0), base.sh_rest_factor_at(15_000)) == (first, 1.0)
-    assert base.sh_rest_factor_at(7500) == pytest.approx(first**0.5)  # half way: the geometric mean
+    assert [base.sh_rest_factor_at(i) for i in (0, 12_000, 15_000)] == [first, first, 1.0]
+    assert base.sh_rest_factor_at(13_500) == pytest.approx(first**0.5)  # half of the decay: the geometric mean
     assert {residual.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
 
 
@@ -370,6 +400,9 @@ def test_epochs_levels_and_seeds_differ_in_order() -> None:
         ({"hierarchy": "nested", "base_sh_degree": 1}, "--base-sh-degree 1: is about residuals"),
         ({"densification": Densification(reset_every=-1)}, "--opacity-reset-every -1: .* or 0 for never"),
         ({"inherit": "most"}, "--inherit 'most': expected geometry"),
+        ({"decay": 0.0}, "--decay 0.0: expected a share of each stage above 0 and at most 1"),
+        ({"decay": 1.5}, "--decay 1.5: expected"),
+        ({"decay": 0.5, "protocol": "paper"}, "--decay 0.5 with --protocol paper: the paper has 1.0"),
         ({"views_per_step": "0"}, "--views-per-step 0: expected auto, or at least 1"),
         ({"seed": -1}, "--seed -1: expected 0 to 4294967295"),
         ({"seed": 2**32}, "--seed 4294967296"),
