@@ -5,6 +5,9 @@ from __future__ import annotations
 
 def main() -> None:
     """Entry point of the console script."""
+    import time
+
+    began = time.monotonic()
     from lapgs_plugin.interrupt import install
 
     install()  # before anything that takes time to import
@@ -18,4 +21,4 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from lapgs_plugin.cli.app import run
 
-    run()
+    run(began)

@@ -146,13 +146,16 @@ def all_commands() -> Any:
     return group
 
 
-def run() -> None:
+def run(began: float | None = None) -> None:
     """Run the command line; a `LapgsError` becomes one line on stderr and its exit code.
 
     The traceback of an exception in a checkout's script begins there, as if Python ran the script.
+
+    Args:
+        began: when the process began, by `time.monotonic`, for the commands' context; None for now.
     """
     try:
-        app(prog_name="lapgs")
+        app(prog_name="lapgs", obj=began)
     except LapgsError as error:
         print(f"lapgs: {error}", file=sys.stderr)
         sys.exit(interrupt.exit_code(error.exit_code))

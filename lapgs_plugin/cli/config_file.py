@@ -121,7 +121,7 @@ def extended_config(path: Path, settings: TrainSettings) -> str | None:
     return re.sub(r'(?m)^strategy = "auto"$', f"strategy = {strategy}", text)
 
 
-def write_config(path: Path, context: typer.Context, **replaced: str | int) -> None:
+def write_config(path: Path, context: typer.Context, **replaced: str | int | None) -> None:
     """Write the parameters of a command that runs as a settings file that makes the same run.
 
     Parameters that are None and `OF_ONE_CALL` are left out.

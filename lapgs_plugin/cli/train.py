@@ -67,6 +67,8 @@ def train(
 
         lapgs train data/garden -o runs/small --resolution 1/4 --iterations 3000
 
+        lapgs train data/garden -o runs/fast --time 2m
+
         lapgs train data/garden -o runs/plain --levels 1    # a single field
 
         lapgs train data/garden -o runs/nested --hierarchy nested    # one PLY
@@ -90,6 +92,7 @@ def train(
         resume=start.resume,
         overwrite=start.overwrite,
         given=frozenset(given),
+        **({"began": context.obj} if isinstance(context.obj, float) else {}),
     )
     watcher = context.with_resource(watching(start.viewing, out.absolute().name))
     if isinstance(context.obj, Rehearsal):
@@ -99,13 +102,18 @@ def train(
         path, extended = run.archive.path(RUN_CONFIG), None
         if not run.resumes:
             masks = run.archive.manifest.scene.masks
-            write_config(path, context, masks=masks, iterations=run.settings.iterations)
+            length = run.settings.iterations if run.settings.time is None else None
+            write_config(path, context, masks=masks, iterations=length)
         elif run.settings.extended:
             extended = extended_config(path, run.settings)
         _train(run, watcher)
         if extended is not None:
             write_text(path, extended)
-    _finish(out, scene)
+    if request.settings.time is None:  # a preview is beyond the time
+        from lapgs_plugin.viewer.preview import save_run_preview
+
+        save_run_preview(out, moved_to=scene)
+    _say_what_is_next(out)
 
 
 def _train(run: PreparedRun, watcher: Watcher) -> None:
@@ -121,13 +129,10 @@ def _train(run: PreparedRun, watcher: Watcher) -> None:
         Trainer(run, monitor=monitor, watcher=watcher).run()
 
 
-def _finish(out: Path, scene: Path) -> None:
-    """Render a preview of the run from its scene's folder, and say what can be done with it."""
+def _say_what_is_next(out: Path) -> None:
+    """Say what can be done with a finished run."""
     from rich.markup import escape
 
-    from lapgs_plugin.viewer.preview import save_run_preview
-
-    save_run_preview(out, moved_to=scene)
     name, word = (escape(printable(text)) for text in (str(out), shlex.quote(str(out))))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",

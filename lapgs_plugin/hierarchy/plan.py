@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from fractions import Fraction
 
@@ -136,6 +136,21 @@ class StagePlan:
     def iterations(self) -> int:
         """Iterations of all stages together."""
         return sum(stage.iterations for stage in self.stages)
+
+    def lasting(self, level: int, iterations: int) -> StagePlan:
+        """Return the plan whose stage of a level has so many iterations, and those of finer levels in proportion.
+
+        >>> [stage.iterations for stage in StagePlan.create((64, 48), 900, 3).lasting(1, 300)]
+        [300, 300, 900]
+        """
+        factor = Fraction(iterations, self[level].iterations)
+
+        def length(stage: Stage) -> int:
+            if stage.level == level:
+                return iterations
+            return stage.iterations if stage.level > level else max(1, round(stage.iterations * factor))
+
+        return replace(self, stages=tuple(replace(stage, iterations=length(stage)) for stage in self))
 
     def iterations_before(self, level: int) -> int:
         """Return the iterations of all stages before that of a level."""

@@ -225,6 +225,11 @@ class RunArchive(RunFiles):
         last = replace(last, overhead_seconds=sums([last.overhead_seconds, seconds]))
         self._write_manifest(replace(self._manifest, records=(*before, last)))
 
+    def change_settings(self, settings: Mapping[str, Any]) -> None:
+        """Write settings of the trainer into the manifest that an unfinished run goes on with."""
+        self._require_lock()
+        self._write_manifest(replace(self._manifest, settings={**self._manifest.settings, **settings}))
+
     def finish_extension(
         self,
         record: LevelRecord,

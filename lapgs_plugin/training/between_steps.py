@@ -12,6 +12,7 @@ from lapgs_plugin.interrupt import StopRequest
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.monitor import Tick
+from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
@@ -26,7 +27,7 @@ class BetweenSteps:
         evaluation: of the stage; its monitor shows progress.
         watcher: looks at the fields.
         stop: of the user.
-        samples: iterations of the stage after which some views are measured.
+        samples: how often some views are measured in the stage.
         last_tick: seconds and iteration of the last tick, or of the start.
         last_checkpoint: when it was written, or when the stage began, by `time.monotonic`.
     """
@@ -34,9 +35,11 @@ class BetweenSteps:
     evaluation: StageEvaluation
     watcher: Watcher
     stop: StopRequest
-    samples: Collection[int]
+    samples: int
     last_tick: tuple[float, int]
     last_checkpoint: float = field(default_factory=time.monotonic)
+    _schedule: StageSchedule | None = field(default=None, init=False)
+    _due: Collection[int] = field(default=(), init=False)
 
     def __call__(self, run: StageRun) -> None:
         """Act on a step that has just ended.
@@ -47,7 +50,7 @@ class BetweenSteps:
         evaluation, stop, test_every = self.evaluation, self.stop, run.prepared.control.test_every
         iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
-        due_sample = run.reached(self.samples)
+        due_sample = run.reached(self._sampled(run.schedule))
         due_tick = run.passed(run.record.history_every)
         if due_test or due_sample or due_tick or stop.requested:
             run.settle()  # so that iterations in progress do not count as overhead
@@ -68,6 +71,12 @@ class BetweenSteps:
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
                 f"a checkpoint is in {run.prepared.archive.path()}, the same command with --resume continues"
             )
+
+    def _sampled(self, schedule: StageSchedule) -> Collection[int]:
+        """Return the iterations after which some views are measured, once for each schedule."""
+        if self._schedule is not schedule:
+            self._schedule, self._due = schedule, schedule.sampled(self.samples)
+        return self._due
 
     def _tick(self, run: StageRun, measured: Mapping[str, float]) -> None:
         before_seconds, before_iteration = self.last_tick

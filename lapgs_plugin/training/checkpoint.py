@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,6 +50,14 @@ class CountsState(_State):
     start_gaussians: NonNegativeInt | None
 
 
+class BudgetState(_State):
+    """Result of `time_budget.StageBudget.state`; seconds are below 0 after the end."""
+
+    planned: PositiveInt
+    stage_seconds: Annotated[float, AllowInfNan(False)]
+    run_seconds: Annotated[float, AllowInfNan(False)]
+
+
 class ModelState(_State):
     """Result of `model.TrainableField.state`."""
 
@@ -84,6 +93,7 @@ class StageState(_State):
     loss: float
     most_views: PositiveInt | None
     breakdown: dict[str, Seconds]
+    budget: BudgetState | None
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
@@ -189,6 +199,10 @@ def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
 
 def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
     """Check the parts of a state against each other and the run; raises ValueError."""
+    if (budget := state["budget"]) is not None:
+        if settings.time is None:
+            raise ValueError(f"budget is {budget}, expected none without --time")
+        stage = replace(stage, iterations=budget["planned"])
     iteration, joint_from = state["counts"]["iteration"], settings.joint_from(stage)
     if state["level"] != stage.level:
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
@@ -196,7 +210,10 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         raise ValueError(f"counts.iteration is {iteration}, expected at most {most}")
     _check_model(state["model"], "model", stage.signed, settings.sh_degree_of(stage.level))
     joint = state.get("joint") or {}
-    wanted = set(finished) - {stage.level} if joint_from is not None and iteration >= joint_from else set()
+    began = iteration >= joint_from if joint_from is not None else False
+    if budget is not None and joint_from is not None:
+        began = bool(joint)  # the stage may have become longer or shorter since
+    wanted = set(finished) - {stage.level} if began else set()
     if joint.keys() != wanted:
         raise ValueError(f"joint has levels {sorted(joint)}, expected {sorted(wanted)}")
     _check_joint(joint, "joint", settings)

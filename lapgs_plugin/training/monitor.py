@@ -103,7 +103,7 @@ class ProgressMonitor(Monitor):
         self._psnr = self._psnr if psnr is None else psnr  # measured rarely: the last one stays visible
         held_out = "" if self._psnr is None else f" PSNR {self._psnr:.2f} dB"
         figures = f"{tick.rate:.1f} it/s loss {tick.loss:.4f} {tick.num_gaussians / 1000:.1f}k Gaussians{held_out}"
-        self._progress.update(self._task, completed=tick.iteration, figures=figures)
+        self._progress.update(self._task, completed=tick.iteration, total=stage.iterations, figures=figures)
 
     def say(self, text: str) -> None:
         if self._advice:

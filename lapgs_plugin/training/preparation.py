@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -20,14 +21,17 @@ from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.masks import resolve_masks, share_inside
 from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
 from lapgs_plugin.training.planning import make_plan, require_pruning
 from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 from lapgs_plugin.training.tensorboard import require_tensorboard
+from lapgs_plugin.training.time_budget import parse_duration, require_time_left
 
-MAY_CHANGE = ("images_on", "prediction_precision")
+MAY_CHANGE = ("images_on", "prediction_precision", "time")
 """Settings that may change when a run is continued."""
 
 logger = logging.getLogger(__name__)
@@ -46,13 +50,16 @@ class TrainRequest:
         settings: of the run. One that is continued keeps its own, but for more iterations and `MAY_CHANGE`.
         photos: how the scene is read.
         control: how the run is executed and observed.
-        resume: continue the run in `out`; a finished one is extended if there are more iterations than it has.
+        resume: continue the run in `out`; a finished one is extended if there are more iterations than it has, and an
+            unfinished one that gets a time ends with it.
         overwrite: replace the run in `out`.
         given: options that the user chose, by parameter name. A run that is continued must have been started with the
             same. A new run on few photos gets fewer iterations if they are not among them.
 
+        began: when the seconds of --time began, by `time.monotonic`.
+
     Raises:
-        UserInputError: `resume` and `overwrite` contradict each other.
+        UserInputError: two options contradict each other.
     """
 
     scene: Path | str
@@ -63,10 +70,18 @@ class TrainRequest:
     resume: bool = False
     overwrite: bool = False
     given: frozenset[str] = frozenset({"iterations"})
+    began: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
             raise UserInputError("--resume and --overwrite contradict each other; give one of them")
+        if (text := self.settings.time) is not None:
+            if {"time", "iterations"} <= self.given:
+                raise UserInputError(f"--time {text} with --iterations: both say how long to train; give one of them")
+            if self.control.gpu_busy:
+                raise UserInputError(
+                    f"--gpu-busy with --time {text}: is measured in stages of a known length; leave it out"
+                )
 
 
 def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextManager[PreparedRun]:
@@ -115,16 +130,41 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
                 f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
                 "over them; more gain little with so few photos, and --iterations asks for another number"
             )
+        if settings.time is not None:  # how long it may be is measured once the photos are read
+            make_plan(size, settings, photos)
+            return
         settings = settings.for_size(size)
         require_pruning(make_plan(size, settings, photos), settings)
 
     scene = load_reference(reference, decide, hold=settings.images_on != "disk")
+    if settings.time is not None:
+        settings = _fitted_into_time(request, scene, placed, say)
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     with RunArchive.create(out, manifest, request.overwrite) as archive:
-        run = PreparedRun.of(scene, settings, archive, placed, request.control)
+        run = PreparedRun.of(scene, settings, archive, placed, request.control, began=request.began)
         _say_about_photos(run, say)
         yield run
+
+
+def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasterizer, say: Say) -> TrainSettings:
+    """Return settings with about as many iterations as --time allows, from which the strategy and the split follow.
+
+    Raises:
+        UserInputError: no time is left for training, or the settings do not go with so few iterations.
+    """
+    settings = request.settings
+    assert settings.time is not None
+    rate, seconds = views_per_second(scene, settings, placed), parse_duration(settings.time)
+    require_time_left(settings.time, spent := time.monotonic() - request.began)
+    iterations = max(settings.levels, round(rate * (seconds - spent)))
+    settings = settings.lasting(iterations, choose="strategy" not in request.given).for_size(scene.smallest_size)
+    require_pruning(make_plan(scene.smallest_size, settings, len(scene.train)), settings)
+    say(
+        f"--time {settings.time}: {seconds - spent:.1f} s are left for training, about {iterations:,} iterations of "
+        f"{rate:.3g} views a second measured on the points; the length of each level follows its rate"
+    )
+    return settings
 
 
 @contextmanager
@@ -142,10 +182,16 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
         settings = settings_from_manifest(manifest, str(file))
         if manifest.complete:
             asked = request.settings.iterations if "iterations" in given else None
-            settings, given = extended_settings(archive, settings, asked, say), given - {"iterations"}
+            _require_untimed(out, settings, request.settings, asked)
+            if settings.time is None:
+                settings = extended_settings(archive, settings, asked, say)
+            else:
+                say(f"{out} is finished: its --time {settings.time} is over")
+            given -= {"iterations"}
         wanted = _options(reference, request.settings, request.control.rasterizer)
         _require_same(out, given, wanted, _options(manifest.scene, settings, manifest.rasterizer))
         changed = {name: wanted[name] for name in MAY_CHANGE if name in given}
+        began = request.began if changed.get("time") != settings.time and "time" in changed else None
         settings = replace(settings, **changed)
         with nullcontext() if changed else errors_about(file):
             placed = training_rasterizer(manifest.rasterizer, settings)
@@ -154,9 +200,25 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
             scene = load_reference(replace(manifest.scene, path=str(scene_folder)), hold=settings.images_on != "disk")
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
-            run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True)
+            run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True, began=began)
+        if began is not None:
+            archive.change_settings({"time": settings.time})
         _say_about_photos(run, say)
         yield run
+
+
+def _require_untimed(out: Path, settings: TrainSettings, wanted: TrainSettings, asked: int | None) -> None:
+    """Refuse to extend a finished run by a time, or one that was trained for a time by iterations."""
+    if wanted.time not in (None, settings.time):
+        raise UserInputError(
+            f"--time {wanted.time}: the run in {out} is finished; extend it by --iterations, or start again with "
+            "--overwrite"
+        )
+    if asked is not None and settings.time is not None:
+        raise UserInputError(
+            f"--iterations {asked}: the run in {out} was trained for --time {settings.time}, and its decay is over; "
+            "start again with --overwrite"
+        )
 
 
 def _options(reference: SceneReference, settings: TrainSettings, rasterizer: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,16 +12,19 @@ from torch import Tensor
 from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
-from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.stages.run import StagedRun
+from lapgs_plugin.training.densification import DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
-from lapgs_plugin.training.planning import make_plan
+from lapgs_plugin.training.planning import iterations_continued, make_plan
 from lapgs_plugin.training.quality import set_aside
+from lapgs_plugin.training.schedule import StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
+from lapgs_plugin.training.strategies import Strategy
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class PreparedRun(StagedRun):
         control: how the run is executed and observed.
         resumes: whether the run continues from its checkpoint, or after its last finished level.
         first_field: the first stage starts from it; None starts from the scene's points.
+        began: when the seconds of --time began, by `time.monotonic`; None goes on with those that are left.
     """
 
     settings: TrainSettings
@@ -44,6 +49,7 @@ class PreparedRun(StagedRun):
     control: TrainingControl
     resumes: bool
     first_field: GaussianField | None
+    began: float | None
 
     @classmethod
     def of(
@@ -56,6 +62,7 @@ class PreparedRun(StagedRun):
         *,
         resumes: bool = False,
         first_field: GaussianField | None = None,
+        began: float | None = None,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
 
@@ -64,7 +71,8 @@ class PreparedRun(StagedRun):
             settings: of the run.
             archive: open for writing.
             placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
-            control, resumes, first_field: see the attributes; by default the run is new and starts from the points.
+            control, resumes, first_field, began: see the attributes; by default the run is new and starts from the
+                points, and a time begins with the training.
 
         Raises:
             UserInputError: as `make_plan`.
@@ -72,7 +80,7 @@ class PreparedRun(StagedRun):
         views = scene.train
         aside = set_aside(views) if settings.keep == BEST else []
         names = {view.name for view in aside}
-        return cls(
+        run = cls(
             scene=replace(scene, train=tuple(view for view in views if view.name not in names)),
             aside=tuple(aside),
             settings=settings,
@@ -83,7 +91,12 @@ class PreparedRun(StagedRun):
             control=control or TrainingControl(),
             resumes=resumes,
             first_field=first_field,
+            began=began,
         )
+        # With --time their lengths were decided by the clock.
+        for record in archive.manifest.records if settings.time is not None else ():
+            run = run.lasting(record.level, record.iterations)
+        return run
 
     @property
     def background(self) -> Tensor:
@@ -94,6 +107,26 @@ class PreparedRun(StagedRun):
     def batches(self) -> bool:
         """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
         return not self.settings.refine_poses and self.rasterizer.can_batch
+
+    def lasting(self, level: int, iterations: int) -> PreparedRun:
+        """Return the run whose stage of a level has so many iterations."""
+        plan = self.plan.lasting(level, iterations)
+        return replace(self, plan=plan, settings=self.settings.lasting(plan.iterations))
+
+    def strategy_of(self, stage: Stage) -> Strategy:
+        """Return the strategy of density control with the options of a stage."""
+        sizes = [level_size(view.camera.size, stage.level) for view in self.scene.train]
+        return self.settings.strategy_of(stage, len(sizes), sum(map(math.prod, sizes)))
+
+    def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
+        """Return the density control of a stage."""
+        return control_of(self.strategy_of(stage), schedule, self.scene.extent)
+
+    def schedule_of(self, stage: Stage) -> StageSchedule:
+        """Return the schedule of a stage."""
+        views = len(self.scene.train)
+        together = views_per_step(self.settings, stage, views, self.batches)
+        return StageSchedule.create(self.settings, stage, iterations_continued(self.plan, stage), together, views)
 
     def record_to_extend(self, stage: Stage) -> LevelRecord | None:
         """Return the record of a finished stage that is to train on; None for all others."""

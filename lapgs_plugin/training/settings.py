@@ -25,6 +25,7 @@ from lapgs_plugin.training.strategies import (
     StagePart,
     Strategy,
 )
+from lapgs_plugin.training.time_budget import parse_duration
 from lapgs_plugin.untrusted import STRICT
 
 SH_RATE_VIEWS, MOST_SH_RATE = 32, 8.0
@@ -165,6 +166,12 @@ class TrainSettings(HierarchySettings):
         f"{REFERENCE_ITERATIONS // PASSES} training photos get {PASSES} for each, but at least {LONG_RUN}.",
         least=1,
     )
+    time: str | None = option(
+        None,
+        "Train for so long instead of --iterations, such as 20s, 2m or 1h: everything from the command's start to the "
+        "last level's end. Each level gets its --split of the seconds.",
+        metavar="DURATION",
+    )
     accumulate_views: int = option(
         8,
         "Views whose gradients are added up for each optimizer step in the last quarter of a stage, once densification "
@@ -251,6 +258,13 @@ class TrainSettings(HierarchySettings):
         _ = self.asked_views
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
+        if self.time is not None:
+            parse_duration(self.time)
+            if self.densification.until is not None:
+                raise UserInputError(
+                    f"--densify-until {self.densification.until} with --time: names an iteration of a run whose length "
+                    "is not known; leave one out"
+                )
         if not 0.0 < self.decay <= 1.0:
             raise UserInputError(f"--decay {self.decay}: expected a share of each stage above 0 and at most 1")
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
@@ -331,9 +345,22 @@ class TrainSettings(HierarchySettings):
         """
         enough, control = enough_iterations(count), self.densification
         timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
-        if enough >= self.iterations or timed or self.protocol == "paper":
+        if enough >= self.iterations or timed or self.protocol == "paper" or self.time is not None:
             return self
         return replace(self, iterations=enough)
+
+    def lasting(self, iterations: int, choose: bool = False) -> TrainSettings:
+        """Return settings of a run of so many iterations.
+
+        Args:
+            iterations: of all stages together.
+            choose: choose the strategy by them, as auto does.
+        """
+        control = self.densification
+        if choose:
+            values = {each.name: getattr(control.options, each.name) for each in fields(control.options)}
+            control = replace(control, strategy=AUTO, options=Auto(**values))
+        return replace(self, iterations=iterations, densification=control)
 
     def for_size(self, size: tuple[int, int]) -> TrainSettings:
         """Return settings whose residuals, if they have two levels and no split was given, are split for their images.

@@ -34,6 +34,7 @@ from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.stage_start import joint_fields
+from lapgs_plugin.training.time_budget import StageBudget
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, level_views, view_index
 
@@ -91,6 +92,7 @@ class StageRun:
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
         record: measures it.
+        budget: decides the stage's length by the clock; None where it is planned.
         say: shows a line to the user.
         joint: the finished fields while they are trained jointly; None before.
         loss: smoothed loss, NaN before the first iteration and after a finished stage.
@@ -112,6 +114,7 @@ class StageRun:
     poses: ViewPoses | None
     record: StageRecord
     say: Callable[[str], None]
+    budget: StageBudget | None = None
     joint: JointFields | None = None
     loss: float = math.nan
     most_views: int | None = None
@@ -152,6 +155,8 @@ class StageRun:
         Raises:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
+        if self.budget is not None:
+            self.budget.start(self.counts.iteration)
         while self.counts.iteration < self.stage.iterations:
             self._profile()
             self.record.resume_clock()
@@ -160,10 +165,29 @@ class StageRun:
             self._step(iterations)
             self.record.pause_clock()
             self.counts.iteration += self.step_views
+            if self.budget is not None:
+                self._last(self.budget.length(self.counts.iteration))
             if len(self._unread) >= self._losses_at_once or self.counts.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
         self._profile()
+
+    def _last(self, iterations: int) -> None:
+        """Let the stage have so many iterations."""
+        if iterations == self.stage.iterations:
+            return
+        self.prepared = self.prepared.lasting(self.stage.level, iterations)
+        self.stage = self.record.stage = self.prepared.plan[self.stage.level]
+        self.record.iterations = self.prepared.plan.iterations
+        self.schedule = self.prepared.schedule_of(self.stage)
+        statistics = self.densifier.state
+        self.densifier = self.prepared.density_control(self.stage, self.schedule)
+        self.densifier.state = statistics
+        if self.joint is None:
+            self._joint_from = self._settings.joint_from(self.stage)
+        for learned in filter(None, self.transforms.values()):
+            learned.total = self.prepared.plan.iterations
+        self._following = None
 
     def _profile(self) -> None:
         """Start or end a profile if it is due, outside the timed region."""
@@ -453,6 +477,7 @@ class StageRun:
             "loss": self.loss,
             "most_views": self.most_views,
             "breakdown": self._breakdown.seconds(),
+            "budget": None if self.budget is None else self.budget.state(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "joint": None if self.joint is None else self.joint.state(),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.errors import DeviceMemoryError, counted
-from lapgs_plugin.hierarchy.plan import Stage, level_size
+from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.hooks import HookDispatcher, StageHook, hooks_line
 from lapgs_plugin.interrupt import StopRequest, stop_request
@@ -25,11 +25,10 @@ from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
-from lapgs_plugin.training.densification import control_of
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
-from lapgs_plugin.training.planning import iterations_continued, unpruned_levels
+from lapgs_plugin.training.planning import unpruned_levels
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.quality import (
     SAMPLES_OF_A_STAGE,
@@ -37,7 +36,7 @@ from lapgs_plugin.training.quality import (
     QualityWatch,
     few_views_line,
 )
-from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_start import (
     first_exposures,
@@ -46,7 +45,7 @@ from lapgs_plugin.training.stage_start import (
     photos_of,
     predict_views,
 )
-from lapgs_plugin.training.strategies import Strategy
+from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
 from lapgs_plugin.training.warm_up import warm_up
 
 
@@ -59,16 +58,19 @@ class Trainer:
         user_hooks: called after the stock ones.
         monitor: shows progress.
         watcher: looks at the fields between iterations.
+        clock: returns seconds, those of `PreparedRun.began`.
     """
 
     prepared: PreparedRun
     user_hooks: Sequence[StageHook] = ()
     monitor: Monitor = field(default_factory=Monitor)
     watcher: Watcher = field(default_factory=Watcher)
+    clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
         settings = self.prepared.settings
         self._quality = QualityWatch()
+        self._ends: float | None = None  # when the run should end, by the clock
         self._hooks = HookDispatcher.create(
             self.prepared.supervision, settings.ssim_weight, self.user_hooks, settings.hooks
         )
@@ -90,16 +92,50 @@ class Trainer:
         with one_pool(), stop_request() as stop, prepared.image_cache():
             try:
                 warm_up(prepared)
+                self._ends = self._run_ends(checkpoint)
                 self.watcher.run_started(archive)
                 if not prepared.resumes:
                     self._say_what_is_chosen()
-                for stage in prepared.plan:
+                for level in reversed(range(prepared.plan.levels)):
+                    stage = self.prepared.plan[level]
                     if stage.level in archive.available_levels and prepared.record_to_extend(stage) is None:
                         continue
                     here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
                     self._run_stage(stage, here, stop)
             except torch.cuda.OutOfMemoryError as error:
                 raise self._out_of_memory() from error
+
+    def _run_ends(self, checkpoint: dict[str, Any] | None) -> float | None:
+        """Return when the run should end, by the clock; None without --time.
+
+        Raises:
+            UserInputError: no time is left for training.
+        """
+        prepared, now = self.prepared, self.clock()
+        if (text := prepared.settings.time) is None:
+            return None
+        if prepared.began is not None:
+            require_time_left(text, now - prepared.began)
+            return prepared.began + parse_duration(text)
+        if checkpoint is not None and checkpoint["budget"] is not None:
+            return now + float(checkpoint["budget"]["run_seconds"])
+        records = prepared.archive.manifest.records
+        spent = sum(record.train_seconds + sum(record.overhead_seconds.values()) for record in records)
+        return now + parse_duration(text) - spent
+
+    def _budget(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageBudget | None:
+        """Return what decides the length of a stage by the clock; None without --time."""
+        if (run_ends := self._ends) is None:
+            return None
+        now, saved = self.clock(), None if checkpoint is None else checkpoint["budget"]
+        if saved is not None and self.prepared.began is None:
+            ends = now + saved["stage_seconds"]
+        else:
+            done = 0 if checkpoint is None else checkpoint["counts"]["iteration"]
+            left = [each.iterations for each in self.prepared.plan if each.level < stage.level]
+            own = max(1, stage.iterations - done)
+            ends = now + (run_ends - now) * own / (own + sum(left))
+        return StageBudget(self.clock, ends, run_ends, stage.iterations, len(self.prepared.scene.test))
 
     def _say_what_is_chosen(self) -> None:
         """Tell the user the effect of the settings on this scene and device."""
@@ -119,14 +155,10 @@ class Trainer:
 
     def _strategy_line(self) -> str:
         """Say how Gaussians are added, and up to which numbers, coarsest level first."""
-        strategies = [self._strategy_of(stage) for stage in self.prepared.plan]
+        strategies = [self.prepared.strategy_of(stage) for stage in self.prepared.plan]
         limits = [f"{strategy.most:,}" for strategy in strategies if strategy.most is not None]
         words = f", at most {' and '.join(limits)} Gaussians" if limits else ""
         return f"density control: --strategy {self.prepared.settings.densification.strategy}{words}"
-
-    def _strategy_of(self, stage: Stage) -> Strategy:
-        sizes = [level_size(view.camera.size, stage.level) for view in self.prepared.scene.train]
-        return self.prepared.settings.strategy_of(stage, len(sizes), sum(map(math.prod, sizes)))
 
     def _checkpoint(self) -> dict[str, Any] | None:
         """Return the checkpoint of the next stage; None if it starts from its beginning."""
@@ -147,6 +179,10 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
+        if checkpoint is not None and checkpoint["budget"] is not None:
+            self.prepared = self.prepared.lasting(stage.level, checkpoint["budget"]["planned"])
+            stage = self.prepared.plan[stage.level]
+        budget = self._budget(stage, checkpoint)
         prepared, aside = self.prepared, self.prepared.aside
         before = prepared.record_to_extend(stage)
         schedule = self._schedule(stage)
@@ -158,7 +194,7 @@ class Trainer:
         with closing(images):
             if stage.signed:
                 predict_views(prepared, stage, images, record.overhead)
-            run = self._stage_run(stage, schedule, model, images, record, checkpoint)
+            run = self._stage_run(stage, schedule, model, images, record, checkpoint, budget)
             evaluation = StageEvaluation(run, self._quality, self.monitor)
             if checkpoint is not None:
                 evaluation.best = checkpoint.get("best")
@@ -175,12 +211,13 @@ class Trainer:
                 evaluation=evaluation,
                 watcher=self.watcher,
                 stop=stop,
-                samples=schedule.sampled(SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE),
+                samples=SAMPLES_TO_KEEP_BEST if aside else SAMPLES_OF_A_STAGE,
                 last_tick=(record.counts.seconds, record.counts.iteration),
             )
             run.hooks.on_stage_start(run.stage)
             self.watcher.stage_started(run.stage)
             run.run(between_steps)
+            self.prepared = run.prepared  # with the length that the stage has got, with --time
             run.hooks.on_stage_end(run.stage)
             evaluation.return_to_best()
             evaluation.note_views()
@@ -237,14 +274,7 @@ class Trainer:
 
     def _schedule(self, stage: Stage) -> StageSchedule:
         """Return the schedule of a stage; tell the user if its views cannot all be rendered together."""
-        settings, plan, train = self.prepared.settings, self.prepared.plan, self.prepared.scene.train
-        schedule = StageSchedule.create(
-            settings,
-            stage,
-            iterations_continued(plan, stage),
-            views_per_step(settings, stage, len(train), self.prepared.batches),
-            len(train),
-        )
+        schedule, train = self.prepared.schedule_of(stage), self.prepared.scene.train
         sizes = {view.camera.size for view in train}
         if schedule.views > 1 and self.prepared.batches and len(sizes) > 1:
             self.monitor.say(
@@ -261,6 +291,7 @@ class Trainer:
         images: StageImages,
         record: StageRecord,
         checkpoint: dict[str, Any] | None,
+        budget: StageBudget | None,
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         prepared, poses = self.prepared, first_poses(self.prepared, stage)
@@ -273,11 +304,12 @@ class Trainer:
             images=images,
             hooks=self._hooks,
             model=model,
-            densifier=control_of(self._strategy_of(stage), schedule, prepared.scene.extent),
+            densifier=prepared.density_control(stage, schedule),
             exposures=first_exposures(prepared, stage, checkpoint, record.overhead, self.monitor),
             poses=poses,
             record=record,
             say=self.monitor.say,
+            budget=budget,
         )
 
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,11 @@ def trained(request: TrainRequest, monitor: Monitor | None = None) -> RunArchive
         ({"photos": SceneOptions(images="gone")}, "gone"),
         ({"control": TrainingControl(rasterizer="none")}, "--rasterizer none: expected auto, gsplat, cpu"),
         ({"control": TrainingControl(rasterizer="cpu", gpu_busy=True)}, "--gpu-busy: expected a CUDA device"),
+        (
+            {"settings": replace(SHORT, time="9s"), "control": TrainingControl(gpu_busy=True)},
+            "--gpu-busy with --time 9s",
+        ),
+        ({"settings": replace(SHORT, time="9s", levels=4), "given": frozenset()}, "level 3 of 4 would be 8x6 pixels"),
         ({"resume": True}, "is not a run, so there is nothing to continue"),
     ],
 )
@@ -105,6 +111,51 @@ def test_few_photos_shorten_a_run_whose_iterations_were_not_chosen(
         assert run.settings.iterations == run.plan.iterations == iterations
         assert run.archive.manifest.settings["iterations"] == iterations
     assert any("16 training photos: 5,000 iterations" in line for line in said) is not bool(given)
+
+
+def test_a_time_that_reading_takes_is_refused_before_anything_is_written(folder: Path, tmp_path: Path) -> None:
+    settings = replace(SHORT, time="3s")
+    late = TrainRequest(folder, tmp_path / "run", settings, given=frozenset(), began=time.monotonic() - 4.0)
+    with (
+        pytest.raises(UserInputError, match=r"--time 3s: reading the scene and compiling took \d+\.\d s"),
+        prepare(late),
+    ):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_machine_decides_how_many_iterations_a_time_has(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And with them the strategy, unless the user chose it."""
+    for rate, given, strategy in ((100.0, {"time"}, "mcmc"), (5.0, {"time"}, "3dgs"), (5.0, {"strategy"}, "mcmc")):
+        monkeypatch.setattr(preparation, "views_per_second", lambda *_, rate=rate: rate)
+        settings = TrainSettings(time="10m", densification=Densification(strategy="mcmc"))
+        said: list[str] = []
+        out = tmp_path / f"{rate}-{strategy}"
+        with prepare(TrainRequest(folder, out, settings, given=frozenset(given)), said.append) as run:
+            assert run.plan.iterations == run.settings.iterations == pytest.approx(600 * rate, rel=0.1)
+            assert run.settings.densification.strategy == strategy
+            assert run.archive.manifest.settings["time"] == "10m"
+        assert any("--time 10m: " in line and f"{rate:.3g} views a second" in line for line in said)
+
+
+def test_an_unfinished_run_that_gets_a_time_ends_with_it(folder: Path, tmp_path: Path) -> None:
+    """Of a hundred thousand iterations only those of the time are trained, and the run cannot be extended."""
+    with pytest.raises(TrainingStoppedError):
+        trained(
+            TrainRequest(folder, tmp_path / "run", replace(SHORT, iterations=100_000), SceneOptions()), StopAt(0, 500)
+        )
+    ends = TrainRequest(folder, tmp_path / "run", replace(SHORT, time="4s"), resume=True, given=frozenset({"time"}))
+    archive = trained(ends)
+    assert 500 < archive.manifest.record(0).iterations < 50_000
+    assert archive.manifest.settings["time"] == "4s"
+    with prepare(replace(ends, began=time.monotonic())) as run:
+        assert run.resumes, "the same command does nothing more"
+    with pytest.raises(UserInputError, match=r"--time 5s: the run in .* is finished"):
+        trained(replace(ends, settings=replace(SHORT, time="5s")))
+    with pytest.raises(UserInputError, match=r"--iterations 20: the run in .* was trained for --time 4s"):
+        trained(replace(ends, settings=SHORT, given=frozenset({"iterations"})))
 
 
 def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from dataclasses import replace
@@ -63,7 +64,7 @@ def test_until_its_decay_a_stage_is_like_a_longer_one(iterations: int, more: int
     rates = [short.means_learning_rate(i) for i in range(short.decay_from, iterations + 1)]
     assert {short.means_learning_rate(i) for i in (0, short.decay_from)} == {long.means_learning_rate(0)}
     assert long.means_learning_rate(short.decay_from) == rates[0] == pytest.approx(1.6e-4)
-    assert all(later < earlier for earlier, later in zip(rates, rates[1:], strict=False))
+    assert all(later < earlier for earlier, later in itertools.pairwise(rates))
     assert rates[-1] == pytest.approx(1.6e-6)
     assert 0 <= short.decay_from < iterations
 

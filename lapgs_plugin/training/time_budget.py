@@ -1,0 +1,100 @@
+"""Fit the length of a stage into the seconds that a run may take. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from lapgs_plugin.errors import UserInputError
+
+UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+"""Seconds of the units of --time."""
+LOOK_SHARE = 0.01
+"""Share of a stage's seconds between two looks at its rate."""
+RATE_SHARE = 0.2
+"""Share of the seconds since the stage began, the last ones, whose rate is taken for that of the rest."""
+TOLERANCE = 0.01
+"""Relative change of the planned length from which on the plan changes."""
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of a duration such as 20s, 2m or 1.5h.
+
+    >>> parse_duration("20s"), parse_duration("1.5m")
+    (20.0, 90.0)
+
+    Raises:
+        UserInputError: it has no unit, is not a number, or is not positive and finite.
+    """
+    number, unit = text[:-1], text[-1:]
+    try:
+        seconds = float(number) * UNITS[unit]
+    except (KeyError, ValueError) as error:
+        raise UserInputError(
+            f"--time {text}: expected a number with its unit, seconds, minutes or hours, such as 20s, 2m or 1h"
+        ) from error
+    if not 0.0 < seconds < math.inf:
+        raise UserInputError(f"--time {text}: expected a time above 0, such as 20s or 2m")
+    return seconds
+
+
+def require_time_left(text: str, spent: float) -> None:
+    """Raise a UserInputError if so many seconds leave nothing of a duration for training."""
+    if spent >= parse_duration(text):
+        raise UserInputError(
+            f"--time {text}: reading the scene and compiling took {spent:.1f} s, so that nothing is left for training; "
+            "give more"
+        )
+
+
+@dataclass
+class StageBudget:
+    """Plan the iterations of a stage by its rate so far, so that it ends in time.
+
+    The rate is that of the clock, so that whatever is done between iterations counts.
+
+    Attributes:
+        clock: returns seconds.
+        ends: when the stage should end, by the clock, with its last measurement.
+        run_ends: when the run should.
+        planned: iterations of the stage.
+        afterwards: views to render after the last iteration, each in about the time of an iteration.
+    """
+
+    clock: Callable[[], float]
+    ends: float
+    run_ends: float
+    planned: int
+    afterwards: int = 0
+    _marks: list[tuple[float, int]] = field(default_factory=list, init=False)  # seconds and iterations at each look
+
+    def start(self, done: int) -> None:
+        """Start to measure the rate, before the first iteration or after `done` ones of a continued stage."""
+        self._marks = [(self.clock(), done)]
+
+    def length(self, iteration: int) -> int:
+        """Return the stage's length in iterations, as planned after one of them."""
+        now, (began, _), (looked, _) = self.clock(), self._marks[0], self._marks[-1]
+        if now >= self.ends:
+            self.planned = iteration
+        elif now - looked >= LOOK_SHARE * (self.ends - began) or iteration >= self.planned:
+            self._marks.append((now, iteration))
+            rate = self._rate(now - RATE_SHARE * (now - began))
+            left = round(rate * (self.ends - now)) - self.afterwards
+            if now - began < (self.ends - began) / 2:
+                left = max(1, left)  # the first iterations may be slow
+            if left <= 0 or abs(iteration + left - self.planned) > TOLERANCE * self.planned:
+                self.planned = iteration + max(0, left)
+        return self.planned
+
+    def state(self) -> dict[str, float]:
+        """Return everything that the clock has decided, and the seconds that are left."""
+        now = self.clock()
+        return {"planned": self.planned, "stage_seconds": self.ends - now, "run_seconds": self.run_ends - now}
+
+    def _rate(self, since: float) -> float:
+        """Return the iterations a second from the last look at or before a time until now."""
+        seconds, iteration = [mark for mark in self._marks if mark[0] <= since][-1]
+        now, done = self._marks[-1]
+        return (done - iteration) / (now - seconds)

@@ -1,0 +1,77 @@
+"""Runs of `lapgs train --time`: the clock decides the lengths of levels, and a stopped run keeps its decisions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lapgs_plugin.errors import TrainingStoppedError
+from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training.settings import TrainSettings
+from tests.training_runs import StopAt, plys, resume, train
+from tests.training_scene import ring_scene
+
+TIMED = TrainSettings(iterations=400, time="6s", sh_degree=1, exposure="on", split="1/2,1/2", joint=0.25)
+"""Of `Ticks` that is 600 iterations; 400 are what was expected."""
+
+
+class Ticks(StageHook):
+    """A clock that goes on by a hundredth of a second with each view that is trained."""
+
+    def __init__(self) -> None:
+        self.seconds = 1000.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+    def after_backward(self, context: StageContext) -> None:
+        self.seconds += 0.01
+
+
+def timed() -> dict[str, Any]:
+    """Return options of a trainer whose clock ticks."""
+    ticks = Ticks()
+    return {"clock": ticks, "user_hooks": [ticks]}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ring_scene()
+
+
+@pytest.fixture(scope="module", params=["laplacian", "nested"])
+def whole(request: pytest.FixtureRequest, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
+    """Return an uninterrupted run."""
+    return train(tmp_path_factory.mktemp("whole") / "run", scene, of_kind(request.param), **timed())
+
+
+def of_kind(hierarchy: str) -> TrainSettings:
+    return replace(TIMED, hierarchy=hierarchy, joint=0.25 if hierarchy == "laplacian" else None)
+
+
+def test_each_level_gets_its_share_of_the_seconds(whole: RunArchive) -> None:
+    base, finest = whole.manifest.records
+    assert base.iterations == pytest.approx(300, rel=0.05)
+    assert finest.iterations == pytest.approx(300, rel=0.05)
+    assert whole.manifest.complete
+    last = [entry for entry in whole.history() if entry["level"] == 0][-1]
+    assert last["iteration"] == finest.iterations
+    assert last["psnr"] > 15.0  # it was 20 dB and more
+
+
+@pytest.mark.parametrize(("level", "iteration"), [(1, 40), (1, 290), (0, 100), (0, 292)])
+def test_a_stopped_run_keeps_what_the_clock_decided(
+    scene: Scene, tmp_path: Path, whole: RunArchive, level: int, iteration: int
+) -> None:
+    settings = of_kind(whole.manifest.settings["hierarchy"])
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "parts", scene, settings, monitor=StopAt(level, iteration), **timed())
+    archive = resume(tmp_path / "parts", scene, settings, **timed())
+    lengths = [record.iterations for record in archive.manifest.records]
+    assert lengths == [record.iterations for record in whole.manifest.records]
+    assert plys(archive) == plys(whole)
