@@ -66,6 +66,7 @@ class TensorboardMonitor(Monitor):
 
     def tick(self, stage: Stage, tick: Tick) -> None:
         assert self._writer is not None, "a stage has started"
+        self._plan = self._plan.lasting(stage.level, stage.iterations)  # with --time its length changes
         for name, title in FIGURES.items():
             if (value := getattr(tick, name)) is not None:
                 step = self._step(tick.level, tick.iteration)
