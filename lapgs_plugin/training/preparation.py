@@ -216,7 +216,7 @@ def _require_untimed(out: Path, settings: TrainSettings, wanted: TrainSettings, 
         )
     if asked is not None and settings.time is not None:
         raise UserInputError(
-            f"--iterations {asked}: the run in {out} was trained for --time {settings.time}, and its decay is over; "
+            f"--iterations {asked}: the run in {out} was trained for --time {settings.time}, and its schedule is over; "
             "start again with --overwrite"
         )
 

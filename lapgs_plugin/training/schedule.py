@@ -45,12 +45,9 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
 class StageSchedule:
     """Tell which events are due in an iteration of one stage. It has no state.
 
-    Iterations count from 1 in each stage. A stage warms up, is stable, and decays at its end. Positions keep their
-    first learning rate until the decay, in which it falls to the last one; so does the factor on the rate of SH above
-    degree 0. The decay of the paper's protocol is the whole stage, as in 3DGS.
-
-    In a stage of n of N iterations, densification ends at `until` scaled by n/N; where neither the user nor the
-    strategy has such an iteration, it ends when the decay begins. The other constants are the settings' own.
+    Iterations count from 1 in each stage. In a stage of n of N iterations, densification ends at `until` scaled by n/N,
+    and the learning rate of positions falls to its last value at n, from the beginning of the decay on: by default the
+    whole stage. So does the factor on the rate of SH above degree 0. The other constants are the settings' own.
 
     A field that was trained before, in `before` iterations of coarser nested levels, keeps its SH degree and stops
     densifying earlier (`plan.nested_densify_until`). Its opacities are reset only if the user says when: resets remove
@@ -58,7 +55,7 @@ class StageSchedule:
     residuals, which start from the base's geometry or positions.
 
     Attributes:
-        decay_from: the last iteration before the decay.
+        decay_from: the last iteration before the decay; 0 where it is the whole stage.
         accumulate_from, accumulate_views: from this iteration on, the gradients of so many views make one step.
         views: the same for earlier steps. A step ends early where something is due.
         extended: iterations after the `iterations` of the schedule, all as the last one is.
@@ -96,14 +93,10 @@ class StageSchedule:
         never = control.reset_every == 0 or "reset_every" in control.options.unused
         if never or (keeps_opacities and control.reset_every is None):
             resets = stage.iterations + 1  # never
-        decay_from = stage.iterations - max(1, round(stage.iterations * settings.decay))
+        until = constant(control.until, control.options.densify_until, 1)
+        of_stage = round(until * stage.iterations / settings.scheduled)
         if (share := settings.densify_share_of(stage)) is not None:
             of_stage = round(share * stage.iterations)
-        elif control.until is None and control.options.densify_until is None:
-            of_stage = max(decay_from, stage.iterations // 2)  # a decay from the start is 3DGS's, which ends it there
-        else:
-            until = constant(control.until, control.options.densify_until or 0, 1)
-            of_stage = round(until * stage.iterations / settings.scheduled)
         densify_until = nested_densify_until(of_stage) if before else of_stage
         extended = settings.extension_of(stage)
         if extended:
@@ -122,7 +115,7 @@ class StageSchedule:
             means_first=rates.means_first,
             means_last=rates.means_last,
             sh_rest_factor=settings.sh_rate_factor_of(stage, training_views),
-            decay_from=decay_from,
+            decay_from=stage.iterations - max(1, round(stage.iterations * settings.decay)),
             accumulate_from=stage.iterations - late + 1,
             accumulate_views=settings.accumulate_views if late >= LEAST_STEPS * settings.accumulate_views else 1,
             before=before,

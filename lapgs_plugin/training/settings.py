@@ -34,9 +34,6 @@ views do not determine how colours depend on direction."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
 
-DECAY = 0.2
-"""Default of --decay."""
-
 LAST, BEST = "last", "best"
 """Choices of --keep."""
 ON, OFF = "on", "off"
@@ -113,7 +110,7 @@ class Densification:
     until: int | None = option(
         None,
         "Iteration of the run at which densification ends; each stage stops at the same share of its own iterations. "
-        "Default: with --strategy mcmc when the decay begins, see --decay; else 15000 of 30000.",
+        "Default: 25000 of 30000 with --strategy mcmc, else 15000.",
         panel=PANEL,
         names=("--densify-until",),
         least=0,
@@ -187,9 +184,10 @@ class TrainSettings(HierarchySettings):
         panel=SCHEDULE,
     )
     decay: float = option(
-        DECAY,
+        1.0,
         "Share of each stage, at its end, in which the step size of positions falls to a hundredth; before that it is "
-        "constant. 1 lets it fall from the first iteration on, as 3DGS and the paper do.",
+        "constant. By default it falls over the whole stage. 0.2 pays for small images and few Gaussians on a CPU, and "
+        "loses at full size on a GPU.",
         panel=SCHEDULE,
     )
     sh_degree: int = option(3, "Highest SH degree, 0 to 3.", panel=SCHEDULE)
@@ -201,8 +199,8 @@ class TrainSettings(HierarchySettings):
     sh_rate_factor: float | None = option(
         None,
         "Factor on the learning rate of SH above degree 0, which is a twentieth of degree 0's, in all levels but "
-        "residuals. It falls exponentially to 1 in each stage's decay. Default: the number of training views divided "
-        f"by {SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
+        "residuals. It falls exponentially to 1 within each stage. Default: the number of training views divided by "
+        f"{SH_RATE_VIEWS}, from 1 to {MOST_SH_RATE:g}.",
         panel=SCHEDULE,
     )
     dropout: float | None = option(

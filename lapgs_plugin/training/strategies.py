@@ -74,8 +74,7 @@ class Strategy:
     only where one inherits it from the other.
 
     Attributes:
-        densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it; None
-            for the beginning of a stage's decay.
+        densify_until: last densification of a run of `plan.REFERENCE_ITERATIONS`, unless --densify-until says it.
         unused: settings of a run, by field name, that have no effect with it; a user who sets one is told.
         few_dropout: default of `TrainSettings.dropout` for fewer than `FEW_PHOTOS` training photos.
         residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
@@ -84,7 +83,7 @@ class Strategy:
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
-    densify_until: ClassVar[int | None] = 15_000
+    densify_until: ClassVar[int] = 15_000
     unused: ClassVar[tuple[str, ...]] = ()
     few_dropout: ClassVar[float] = 0.0
     residual_joint: ClassVar[float | None] = None
@@ -241,7 +240,7 @@ class Multiview(Gradients):
 class Mcmc(Regularized):
     """Move transparent Gaussians to opaque ones and add some up to a limit (Kheradmand et al. 2024)."""
 
-    densify_until: ClassVar[int | None] = None
+    densify_until: ClassVar[int] = 25_000
     default_weight: ClassVar[float] = 0.01
     few_dropout: ClassVar[float] = 0.2
     residual_joint: ClassVar[float | None] = 0.5

@@ -85,7 +85,7 @@ def test_a_stage_ends_in_time_however_it_was_planned(
 @settings(deadline=None, max_examples=50)
 @given(st.floats(0.01, 0.1), st.floats(30.0, 300.0))
 def test_at_an_even_rate_the_first_plan_holds(cost: float, seconds: float) -> None:
-    """So what the decay depends on is known long before it begins."""
+    """So the progress, from which rates follow, is the share of the seconds that are over."""
     clock = Clock(0.0)
     budget, plans = StageBudget(clock, seconds, seconds, 10**6), set()
     budget.start(0)
@@ -95,6 +95,8 @@ def test_at_an_even_rate_the_first_plan_holds(cost: float, seconds: float) -> No
         clock.seconds += cost
         budget.length(done)
         plans.add(budget.planned)
+        if len(plans) == 2:  # after the first look
+            assert done / budget.planned == pytest.approx(clock.seconds / seconds, abs=0.02)
     assert len(plans) <= 2
     assert done == pytest.approx(seconds / cost, rel=0.02, abs=1)
 

@@ -51,40 +51,66 @@ def test_a_single_stage_of_30000_has_the_published_constants() -> None:
     (schedule,) = schedules(levels=1)
     assert (schedule.densify_start, schedule.densify_until) == (500, 15_000)
     assert (schedule.densify_every, schedule.reset_every, schedule.sh_every) == (100, 3000, 1000)
-    assert [schedule.means_learning_rate(i) for i in (0, 15_000, 24_000)] == pytest.approx([1.6e-4] * 3)
-    assert schedule.means_learning_rate(27_000) == pytest.approx(1.6e-5)  # half of the decay: the geometric mean
+    assert schedule.means_learning_rate(0) == pytest.approx(1.6e-4)
+    assert schedule.means_learning_rate(15_000) == pytest.approx(1.6e-5)  # log-linear: the geometric mean half way
     assert schedule.means_learning_rate(30_000) == pytest.approx(1.6e-6)
     assert [schedule.active_sh_degree(i) for i in (1, 999, 1000, 2999, 3000, 30_000)] == [0, 0, 1, 2, 3, 3]
 
 
-@given(st.integers(1, 30_000), st.integers(0, 30_000), st.floats(0.01, 1.0))
-def test_until_its_decay_a_stage_is_like_a_longer_one(iterations: int, more: int, decay: float) -> None:
-    """So one run gives the curve of all lengths. In the decay rates fall to 3DGS's last ones."""
-    (short,), (long,) = (schedules(levels=1, iterations=n, decay=decay) for n in (iterations, iterations + more))
-    rates = [short.means_learning_rate(i) for i in range(short.decay_from, iterations + 1)]
-    assert {short.means_learning_rate(i) for i in (0, short.decay_from)} == {long.means_learning_rate(0)}
-    assert long.means_learning_rate(short.decay_from) == rates[0] == pytest.approx(1.6e-4)
-    assert all(later < earlier for earlier, later in itertools.pairwise(rates))
-    assert rates[-1] == pytest.approx(1.6e-6)
-    assert 0 <= short.decay_from < iterations
+@given(st.integers(1, 30_000), st.floats(0.01, 1.0))
+def test_rates_are_constant_until_the_decay_and_fall_in_it(iterations: int, decay: float) -> None:
+    (schedule,) = schedules(levels=1, iterations=iterations, decay=decay)
+    rates = [schedule.means_learning_rate(i) for i in range(iterations + 1)]
+    assert 0 <= schedule.decay_from < iterations
+    assert iterations - schedule.decay_from == pytest.approx(decay * iterations, abs=1.0)
+    assert set(rates[: schedule.decay_from]) <= {rates[0]}
+    assert all(later < earlier for earlier, later in itertools.pairwise(rates[schedule.decay_from :]))
+    assert (rates[0], rates[-1]) == pytest.approx((1.6e-4, 1.6e-6))
 
 
-def test_the_papers_rates_fall_from_the_first_iteration_on() -> None:
-    settings = TrainSettings(protocol="paper")
+@pytest.mark.parametrize("protocol", ["default", "paper"])
+def test_rates_fall_from_the_first_iteration_on_unless_a_decay_is_given(protocol: str) -> None:
+    settings = TrainSettings(protocol=protocol)
     for stage in StagePlan.create((1600, 1066), 30_000, 2, settings.shares, settings.kind):
         schedule, n = StageSchedule.create(settings, stage), stage.iterations
         expected = [1.6e-4 * 100 ** (-i / n) for i in (0, 1, n // 2, n)]
         assert [schedule.means_learning_rate(i) for i in (0, 1, n // 2, n)] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("decay", "until", "ends"), [(0.2, None, 24_000), (0.1, None, 27_000), (1.0, None, 15_000), (0.2, 7000, 7000)]
-)
-def test_mcmc_refines_until_the_decay(decay: float, until: int | None, ends: int) -> None:
-    """A decay that begins at once leaves it the half that 3DGS has."""
+@pytest.mark.parametrize(("decay", "until", "ends"), [(1.0, None, 25_000), (0.2, None, 25_000), (0.2, 7000, 7000)])
+def test_mcmc_refines_for_five_sixths_of_a_stage(decay: float, until: int | None, ends: int) -> None:
     settings = TrainSettings(levels=1, decay=decay, densification=Densification(strategy="mcmc", until=until))
     (stage,) = StagePlan.create((1600, 1066), 30_000, 1)
     assert StageSchedule.create(settings, stage).densify_until == ends
+
+
+@given(
+    st.sampled_from(["3dgs", "mcmc"]),
+    st.sampled_from([1.0, 0.2]),
+    st.lists(st.integers(10, 60_000), min_size=2, max_size=6),
+    st.floats(0.0, 1.0),
+)
+def test_at_a_share_of_a_stage_it_does_not_matter_how_its_length_came_about(
+    strategy: str, decay: float, lengths: list[int], share: float
+) -> None:
+    """With --time the length changes while the stage trains: the last one counts, as if it had been planned."""
+    first, *_, last = lengths
+    control = Densification(strategy=strategy)
+    settings = TrainSettings(levels=1, iterations=first, decay=decay, densification=control)
+    plan = StagePlan.create((1600, 1066), first, 1)
+    for length in lengths[1:]:
+        plan = plan.lasting(0, length)
+        settings = settings.lasting(plan.iterations)
+    timed = StageSchedule.create(settings, plan[0])
+    planned = TrainSettings(levels=1, iterations=last, decay=decay, densification=control)
+    assert timed == StageSchedule.create(planned, StagePlan.create((1600, 1066), last, 1)[0])
+    iteration = round(share * last)
+    decayed = max(0.0, share - (1.0 - decay)) / decay
+    # An iteration is at most half an iteration away from the share, and so is the beginning of the decay.
+    apart = 100.0 ** (1.0 / (max(1, round(decay * last)) - 0.5))
+    expected = 1.6e-4 * 100.0**-decayed
+    assert expected / apart <= timed.means_learning_rate(iteration) * 1.0000001
+    assert timed.means_learning_rate(iteration) <= expected * apart * 1.0000001
 
 
 def test_a_stage_scales_when_densification_ends_and_keeps_the_rest() -> None:
@@ -234,8 +260,8 @@ def test_the_rate_of_higher_harmonics_follows_the_views_and_falls(
     settings = TrainSettings(hierarchy="laplacian", sh_rate_factor=given)
     plan = StagePlan.create((1600, 1066), 30_000, 2, settings.shares, settings.kind)
     base, residual = (StageSchedule.create(settings, stage, training_views=views) for stage in plan)
-    assert [base.sh_rest_factor_at(i) for i in (0, 12_000, 15_000)] == [first, first, 1.0]
-    assert base.sh_rest_factor_at(13_500) == pytest.approx(first**0.5)  # half of the decay: the geometric mean
+    assert (base.sh_rest_factor_at(0), base.sh_rest_factor_at(15_000)) == (first, 1.0)
+    assert base.sh_rest_factor_at(7500) == pytest.approx(first**0.5)  # half way: the geometric mean
     assert {residual.sh_rest_factor_at(i) for i in (1, 7500, 15_000)} == {1.0}
 
 
