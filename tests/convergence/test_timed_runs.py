@@ -61,7 +61,7 @@ def test_each_level_gets_its_share_of_the_seconds(whole: RunArchive) -> None:
     assert whole.manifest.complete
     last = [entry for entry in whole.history() if entry["level"] == 0][-1]
     assert last["iteration"] == finest.iterations
-    assert last["psnr"] > 15.0  # it was 20 dB and more
+    assert last["psnr"] > 15.0  # 17.2 dB seen
 
 
 @pytest.mark.parametrize(("level", "iteration"), [(1, 40), (1, 290), (0, 100), (0, 292)])
