@@ -30,18 +30,18 @@ def absent_modules(logs: bool = False) -> dict[str, ModuleType]:
     Args:
         logs: also for TensorBoard, which most checkouts do without by themselves.
     """
-    found: dict[str, ModuleType] = {}
+    absent: dict[str, ModuleType] = {}
     if logs and find_spec("tensorboard") is None:
-        found[_LOGS] = _AbsentModule(_LOGS, "tensorboard", {"SummaryWriter": NoLog})
+        absent[_LOGS] = _AbsentModule(_LOGS, "tensorboard", {"SummaryWriter": NoLog})
     for package, (distribution, modules) in _PACKAGES.items():
         if package in sys.modules or find_spec(package) is not None:
             continue
         for name, contents in modules.items():
-            found[name] = _AbsentModule(name, distribution, contents)
+            absent[name] = _AbsentModule(name, distribution, contents)
             parent, _, child = name.rpartition(".")
             if parent:
-                setattr(found[parent], child, found[name])
-    return found
+                setattr(absent[parent], child, absent[name])
+    return absent
 
 
 class _AbsentModule(ModuleType):

@@ -37,13 +37,13 @@ class Replacement:
     def label(self) -> str:
         """Full name of the symbol."""
         owner = self.owner
-        place = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
-        return f"{place}.{self.name}"
+        owner_name = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
+        return f"{owner_name}.{self.name}"
 
 
 def of_class(kind: type, name: str, make: Callable[[Any], Any], consumer: str) -> list[Replacement]:
     """Return the replacement of a method where a class or its nearest base defines it, if there is one."""
-    owner = next((each for each in kind.__mro__ if name in vars(each)), None)
+    owner = next((base for base in kind.__mro__ if name in vars(base)), None)
     return [] if owner is None else [Replacement(owner, name, make, consumer)]
 
 
@@ -100,12 +100,12 @@ def _verify(replacement: Replacement) -> None:
         return
     original = vars(replacement.owner)[replacement.name]
     try:
-        found = tuple(inspect.signature(original).parameters)
+        parameters = tuple(inspect.signature(original).parameters)
     except (TypeError, ValueError):
-        found = ()
-    if found[: len(replacement.parameters)] != replacement.parameters:
+        parameters = ()
+    if parameters[: len(replacement.parameters)] != replacement.parameters:
         raise UserInputError(
-            f"{replacement.label} takes ({', '.join(found)}), expected it to begin with "
+            f"{replacement.label} takes ({', '.join(parameters)}), expected it to begin with "
             f"({', '.join(replacement.parameters)}); {changed}: choose another with --backbone, or train with "
             "`lapgs run --off`"
         )

@@ -131,8 +131,8 @@ def _variant(fitting: Callable[[], str]) -> tuple[str, str]:
 
 def _our_modules(source: CheckoutSource, variant: str) -> dict[str, ModuleType]:
     """Return our modules by full name: those of a variant, and without one those that need none."""
-    found = stand_ins(variant or next(iter(VARIANTS)), neighbours=source.unpacks("distCUDA2"))
-    return {name: module for name, module in found.items() if variant or package_of(name) in COMPANIONS}
+    modules = stand_ins(variant or next(iter(VARIANTS)), neighbours=source.unpacks("distCUDA2"))
+    return {name: module for name, module in modules.items() if variant or package_of(name) in COMPANIONS}
 
 
 def _problems(
@@ -165,7 +165,7 @@ def _needed(one: External, source: CheckoutSource, ours: Mapping[str, ModuleType
 
 def _import_error(*names: list[str]) -> str:
     """Return why modules, or names of them, cannot be imported in a process of their own; empty if they can."""
-    wanted = dict.fromkeys(name for each in names for name in each)
+    wanted = dict.fromkeys(name for use_names in names for name in use_names)
     # Extensions find PyTorch's libraries after it is loaded.
     return run_probe("import", "torch", *wanted).error if wanted else ""
 
@@ -173,8 +173,8 @@ def _import_error(*names: list[str]) -> str:
 def _of_other_code(source: CheckoutSource, module: str) -> str:
     """Return how an installed rasterizer differs from what the checkout calls; forks share names of modules."""
     names = vars(importlib.import_module(module))
-    found = (unlike(use, names) for use in source.rasterizers if use.module == module)
-    return next((f"the installed one {why}" for why in found if why), "")
+    reasons = (unlike(use, names) for use in source.rasterizers if use.module == module)
+    return next((f"the installed one {why}" for why in reasons if why), "")
 
 
 def _as_installed(source: CheckoutSource, variant: str, module: str) -> str:
@@ -183,7 +183,7 @@ def _as_installed(source: CheckoutSource, variant: str, module: str) -> str:
     A checkout whose calls depend on what is installed fits several.
     """
     installed = _call_of(vars(importlib.import_module(module)))
-    alike = [name for name, each in VARIANTS.items() if each.module == module and each.settings]
+    alike = [name for name, variant in VARIANTS.items() if variant.module == module and variant.settings]
     called_so = (name for name in (variant, *alike) if _call_of(rasterizer_module(name)) == installed)
     return next((name for name in called_so if _fits(source, name)), variant)
 

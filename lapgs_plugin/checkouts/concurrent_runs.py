@@ -25,8 +25,10 @@ from lapgs_plugin.files import whole_file
 
 logger = logging.getLogger(__name__)
 
-MODULE, LISTEN = "network_gui", "init"
-"""The family's module for its viewer, and its function of host and port."""
+MODULE = "network_gui"
+"""The family's module for its viewer."""
+LISTEN = "init"
+"""That module's function of host and port, which opens the viewer's socket."""
 
 
 def beside_other_runs(profile: Profile) -> list[Replacement]:
@@ -65,7 +67,7 @@ def _at_a_free_port(original: Callable[..., Any]) -> Callable[..., Any]:
                 raise
         result = original(host, 0)  # any port that is free
         sockets = [value for value in original.__globals__.values() if isinstance(value, socket.socket)]
-        at = ", ".join(str(each.getsockname()[1]) for each in sockets)
+        at = ", ".join(str(listening.getsockname()[1]) for listening in sockets)
         logger.warning("port %s is taken, perhaps by another run; the checkout's viewer finds this run at %s", port, at)
         return result
 

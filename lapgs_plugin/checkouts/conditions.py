@@ -28,13 +28,13 @@ def default_options(trees: Iterable[ast.Module]) -> dict[str, Any]:
     """
     script, *modules = trees
     functions = [node for tree in (script, *modules) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    declaring = [node for node in functions if any(each.arg == PARSER for each in node.args.args)]
+    declaring = [node for node in functions if any(argument.arg == PARSER for argument in node.args.args)]
     values: dict[str, list[Any]] = {}
     for node in (*ast.walk(script), *(node for function in declaring for node in ast.walk(function))):
         if isinstance(node, ast.Call) and called_name(node) == "add_argument":
             words = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
             flag = {"store_true": False, "store_false": True}.get(str(words.get("action")))
-            names = [str(each.value) for each in node.args if isinstance(each, ast.Constant)]
+            names = [str(argument.value) for argument in node.args if isinstance(argument, ast.Constant)]
             name, default = names[-1].strip("-").replace("-", "_") if names else "", words.get("default", flag)
         elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
             name, default = getattr(node.targets[0], "attr", "").removeprefix("_"), node.value.value
@@ -79,13 +79,13 @@ class Branches:
 
     def arguments(self, function: ast.FunctionDef, call: ast.Call) -> dict[str, Any]:
         """Return the arguments of a call that are constants or options by parameter, defaults included."""
-        parameters = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
+        parameters = [argument.arg for argument in (*function.args.posonlyargs, *function.args.args)]
         defaults = function.args.defaults
         values = dict(zip(parameters[len(parameters) - len(defaults) :], defaults, strict=True))
-        given = parameters[1:] if parameters[:1] == ["self"] else parameters
-        values |= dict(zip(given, call.args, strict=False))
+        positional = parameters[1:] if parameters[:1] == ["self"] else parameters
+        values |= dict(zip(positional, call.args, strict=False))
         values |= {word.arg: word.value for word in call.keywords if word.arg is not None}
-        if any(word.arg is None for word in call.keywords) or any(isinstance(each, ast.Starred) for each in call.args):
+        if any(word.arg is None for word in call.keywords) or any(isinstance(item, ast.Starred) for item in call.args):
             return {}
         changed, known = stored_names(function), {}
         for name, value in values.items():
@@ -109,7 +109,7 @@ class Branches:
         if not all(isinstance(node, DECIDABLE) for node in nodes):
             raise ValueError("it does more than compare")
         holders = (node.value for node in nodes if isinstance(node, ast.Attribute))
-        namespaces = {each.id for each in holders if isinstance(each, ast.Name)} - {"self"}
+        namespaces = {holder.id for holder in holders if isinstance(holder, ast.Name)} - {"self"}
         names = {**dict.fromkeys(namespaces, self._options), **variables, "__builtins__": {}}
         try:
             return eval(compile(ast.Expression(expression), "", "eval"), names)

@@ -64,15 +64,15 @@ class LateNumbers(Change):
         inside = [node for loop in loops for node in ast.walk(loop)]
         reads_clock = not CLOCKS.isdisjoint({*called_names(inside), *called_methods(inside)})
         self._waits = set() if reads_clock else {wait for node in inside for wait in _waits_for_times(node)}
-        self.found = len(self._late)
+        self.changes = len(self._late)
 
     def visit(self, node: ast.AST) -> ast.AST:
         """Return the node, or what takes its place."""
-        made = self._instead_of(node)
+        replacement = self._instead_of(node)
         if node in self._waited_for:
-            assert isinstance(made, ast.expr), "a variable, or what is computed with it"
-            made = call(NUMBER, made)
-        return made if made is node else ast.fix_missing_locations(ast.copy_location(made, node))
+            assert isinstance(replacement, ast.expr), "a variable, or what is computed with it"
+            replacement = call(NUMBER, replacement)
+        return replacement if replacement is node else ast.fix_missing_locations(ast.copy_location(replacement, node))
 
     def _instead_of(self, node: ast.AST) -> ast.AST:
         self.generic_visit(node)
@@ -80,9 +80,9 @@ class LateNumbers(Change):
             case ast.Expr(value=value) if value in self._waits:
                 return ast.Pass()
             case ast.Expr(value=ast.Call(ast.Attribute(ast.Name(id=event), "record"), args, keywords)):
-                made = call(RECORD, ast.Name(event, ast.Load()), *args)
-                made.keywords = keywords
-                return ast.Assign([ast.Name(event, ast.Store())], made) if event in self._timed else node
+                record = call(RECORD, ast.Name(event, ast.Load()), *args)
+                record.keywords = keywords
+                return ast.Assign([ast.Name(event, ast.Store())], record) if event in self._timed else node
             case ast.Call(func=ast.Attribute(value, "item")) if node in self._late:
                 return call(READ, value)
             case ast.Call(func=ast.Attribute(value, "elapsed_time"), args=args, keywords=[]):
@@ -115,7 +115,7 @@ class _Uses:
         """
         shared = _shared(self._nodes)
         known, waiting = set(names), set[ast.AST]()
-        open_numbers = [*numbers, *(each for name in known for each in self._loads(name))]
+        open_numbers = [*numbers, *(number for name in known for number in self._loads(name))]
         while open_numbers:
             number = open_numbers.pop()
             while _computes(self._parents[number], number):
@@ -162,14 +162,14 @@ class _Uses:
     def _is_shown_by(self, call: ast.Call, function: str, number: ast.expr, keyword: str | None) -> bool:
         """Return whether another function of the script does no more with an argument than show it."""
         other = self._others.get(function)
-        starred = any(isinstance(each, ast.Starred) for each in call.args)
-        if other is None or starred or not all(ast.unparse(each).endswith(HARMLESS) for each in other.decorator_list):
+        starred = any(isinstance(argument, ast.Starred) for argument in call.args)
+        if other is None or starred or not all(ast.unparse(node).endswith(HARMLESS) for node in other.decorator_list):
             return False
-        places = [each.arg for each in (*other.args.posonlyargs, *other.args.args)]
+        places = [argument.arg for argument in (*other.args.posonlyargs, *other.args.args)]
         if keyword is None:
-            place = call.args.index(number)
-            keyword = places[place] if place < len(places) else None
-        elif keyword not in (*places, *(each.arg for each in other.args.kwonlyargs)):
+            position = call.args.index(number)
+            keyword = places[position] if position < len(places) else None
+        elif keyword not in (*places, *(argument.arg for argument in other.args.kwonlyargs)):
             return False
         if keyword is None or (function, keyword) in self._followed:
             return False
@@ -209,9 +209,9 @@ def _local_events(nodes: Sequence[ast.AST]) -> set[str]:
     names = [node for node in nodes if isinstance(node, ast.Name)]
     loaded = Counter(node.id for node in names if isinstance(node.ctx, ast.Load))
     stored = Counter(node.id for node in names if not isinstance(node.ctx, ast.Load))
-    made = Counter(name for node in nodes if (name := _new_event(node)) is not None)
+    recorded = Counter(name for node in nodes if (name := _new_event(node)) is not None)
     used = Counter(name for node in nodes for name in _events(node))
-    return {name for name in made if (stored[name], loaded[name]) == (made[name], used[name])} - _shared(nodes)
+    return {name for name in recorded if (stored[name], loaded[name]) == (recorded[name], used[name])} - _shared(nodes)
 
 
 def _events(node: ast.AST) -> tuple[str, ...]:
@@ -233,11 +233,11 @@ def _new_event(node: ast.AST) -> str | None:
 
 def _waits_for_times(node: ast.AST) -> list[ast.expr]:
     """Return the calls of `torch.cuda.synchronize()` in a block that are right before a time of events."""
-    found = []
+    waits = []
     for block in (getattr(node, name, None) for name in ("body", "orelse", "finalbody")):
         statements = block if isinstance(block, list) else []  # a lambda's body is an expression
         for statement, following in pairwise(statements):
             times = "elapsed_time" in called_methods(ast.walk(following))
             if times and isinstance(statement, ast.Expr) and ast.unparse(statement) == "torch.cuda.synchronize()":
-                found.append(statement.value)
-    return found
+                waits.append(statement.value)
+    return waits

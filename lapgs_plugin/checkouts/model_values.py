@@ -24,14 +24,16 @@ def explain_values_beside(source: CheckoutSource, parameters: Collection[str], *
     methods, _ = methods_of(classes[source.model[0]], classes)
     if START not in methods:
         return None
-    made = _attributes(source.branches.executed(methods[START], {}, surely=surely), ast.Store)
-    beside = sorted(made.intersection(_rendered(source, methods, surely)).difference(parameters, OF_ANY_FIELD))
+    attributes = _attributes(source.branches.executed(methods[START], {}, surely=surely), ast.Store)
+    beside = sorted(attributes.intersection(_rendered(source, methods, surely)).difference(parameters, OF_ANY_FIELD))
     return values_beside(source.model[1], beside) if beside else None
 
 
-def values_beside(place: str, names: Iterable[str]) -> str:
+def values_beside(location: str, names: Iterable[str]) -> str:
     """Return a clause that says which attributes of a model at a place in a checkout fields do not have."""
-    return f"its Gaussians ({place}) are rendered with {', '.join(names)}, which {START}() makes and fields do not have"
+    return (
+        f"its Gaussians ({location}) are rendered with {', '.join(names)}, which {START}() makes and fields do not have"
+    )
 
 
 def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef], surely: bool) -> set[str]:
@@ -51,9 +53,9 @@ def _rendered(source: CheckoutSource, methods: Mapping[str, ast.FunctionDef], su
         seen.add(name)
         known = branches.arguments(functions[name], calls[name]) if name in calls else {}
         nodes = list(branches.executed(functions[name], known, surely=surely))
-        found = _attributes(nodes, ast.Load)
-        read |= found
-        waiting += [*found, *called_names(nodes)]
+        loaded = _attributes(nodes, ast.Load)
+        read |= loaded
+        waiting += [*loaded, *called_names(nodes)]
     return read
 
 

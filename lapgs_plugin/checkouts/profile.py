@@ -78,8 +78,8 @@ class Profile:
         self.source = CheckoutSource.read(script.path)
         self.model = self._find_model()
         self.scene = self._find_scene()
-        makers = [(each, vars(each).get("__init__")) for each in self._classes()]
-        self.cameras = tuple(each for each, make in makers if _attributes_set(make) >= CAMERA_ROLES)
+        makers = [(kind, vars(kind).get("__init__")) for kind in self._classes()]
+        self.cameras = tuple(kind for kind, make in makers if _attributes_set(make) >= CAMERA_ROLES)
         self.training: Callable[..., Any] = vars(script.module)[self.source.training.name]
         self.renderers = tuple(self._find_renderers())
         self._model_call = self._first_call(self.script_names(self.model))
@@ -96,7 +96,9 @@ class Profile:
     def choose_model(self, model: type) -> None:
         """Note which class the script makes its model of."""
         self.model = model
-        chosen = next((each for each in self.source.models if each[0] == model.__name__), self.source.model)
+        chosen = next(
+            (candidate for candidate in self.source.models if candidate[0] == model.__name__), self.source.model
+        )
         self.source = replace(self.source, model=chosen)
 
     @property
@@ -121,15 +123,15 @@ class Profile:
     def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
         """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
         use = rasterizer.use
-        found = self.holders(vars(rasterizer.module)[name])
+        holders = self.holders(vars(rasterizer.module)[name])
         if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call
-            found.append((rasterizer.module, name))
+            holders.append((rasterizer.module, name))
         holder = self._holder(use)
-        if holder is None or name not in vars(holder) or (holder, name) in found:
-            return found
+        if holder is None or name not in vars(holder) or (holder, name) in holders:
+            return holders
         # Something that wraps it, unless another rasterizer has the same name and this one is imported in a function.
-        others = [vars(each.module).get(name) for each in self.rasterizers if each.module is not rasterizer.module]
-        return found if any(vars(holder)[name] is other for other in others) else [*found, (holder, name)]
+        others = [vars(other.module).get(name) for other in self.rasterizers if other.module is not rasterizer.module]
+        return holders if any(vars(holder)[name] is other for other in others) else [*holders, (holder, name)]
 
     def make_model(self, values: Mapping[str, Any]) -> Any:
         """Return a model, made with the arguments that the script gives, or by its statements if it names no class.
@@ -145,7 +147,7 @@ class Profile:
         statements, name = self.source.model_statements, self.source.model_variable
         if not statements:
             return self._call(self.model, self._model_call, values, {})
-        names, where = {**vars(self.script.module), **values}, self.source.place(statements[-1])
+        names, where = {**vars(self.script.module), **values}, self.source.location(statements[-1])
         try:
             exec(compile(ast.Module(statements, []), str(self.script.path), "exec", dont_inherit=True), names)
         except Exception as error:  # the statements need something that exists in the loop only
@@ -173,7 +175,7 @@ class Profile:
             )
         return self._call(self.scene, self._scene_call, {**values, self.source.model_variable: model}, {})
 
-    def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **given: Any) -> Any:
+    def render(self, values: Mapping[str, Any], view: Any, model: Any, background: Any, **options: Any) -> Any:
         """Render a view as the training loop does, and return what its function returns.
 
         Arguments that depend on the loop's state, such as the size of a photo, have their defaults. Flags of training,
@@ -184,7 +186,7 @@ class Profile:
             view: the camera.
             model: the Gaussians.
             background: (3,) behind them.
-            given: arguments to pass whatever the loop passes; those that the function does not take are left out.
+            options: arguments to pass whatever the loop passes; those that the function does not take are left out.
 
         Raises:
             UserInputError: the loop calls no function that rasterizes, or one that needs more than can be known here.
@@ -199,7 +201,7 @@ class Profile:
         first, second, *others = _parameters(renderer)
         named = {name: background for name in others if BACKGROUND_WORDS & set(name.split("_"))}
         named |= {name: False for name in others if self._is_training_flag(name, values)}
-        named |= {first: view, second: model} | {name: value for name, value in given.items() if name in others}
+        named |= {first: view, second: model} | {name: value for name, value in options.items() if name in others}
         # Looked up at each call: it may be replaced meanwhile.
         function = vars(sys.modules[renderer.__module__])[renderer.__name__]
         return self._call(function, self._loop_call, values, named)
@@ -226,21 +228,21 @@ class Profile:
 
     @property
     def _training_place(self) -> str:
-        return f"{self.source.place(self.source.training)}: {self.source.training.name}"
+        return f"{self.source.location(self.source.training)}: {self.source.training.name}"
 
     def _find_model(self) -> type:
         name, where = self.source.model
-        for found in self._classes():
-            if found.__name__ == name and all(hasattr(found, role) for role in MODEL_ROLES):
-                return found
+        for kind in self._classes():
+            if kind.__name__ == name and all(hasattr(kind, role) for role in MODEL_ROLES):
+                return kind
         raise UserInputError(
             f"{name} in {where} has no {' and '.join(MODEL_ROLES)}, expected of the class of the Gaussians; {OTHERWISE}"
         )
 
     def _find_scene(self) -> type:
-        for found in self._classes():
-            if all(hasattr(found, role) for role in SCENE_ROLES):
-                return found
+        for kind in self._classes():
+            if all(hasattr(kind, role) for role in SCENE_ROLES):
+                return kind
         raise UserInputError(
             f"{self.script.path} imports no class with {' and '.join(SCENE_ROLES)}, expected of a scene; {OTHERWISE}"
         )
@@ -262,7 +264,7 @@ class Profile:
             return None
         name = called_name(self._loop_call)
         held = vars(self.script.module).get(name)
-        return next((found for found in self.renderers if found is held or found.__name__ == name), None)
+        return next((renderer for renderer in self.renderers if renderer is held or renderer.__name__ == name), None)
 
     def _find_rasterizers(self) -> Iterator[BoundRasterizer]:
         name = None if self.loop_renderer is None else self.loop_renderer.__name__
@@ -299,7 +301,7 @@ class Profile:
         function: Callable[..., Any],
         call: ast.Call | None,
         values: Mapping[str, Any],
-        given: Mapping[str, Any],
+        fixed: Mapping[str, Any],
     ) -> Any:
         """Call a function with the arguments of a call in the script, as far as they can be evaluated outside of it."""
         parameters = _parameters(function)
@@ -307,16 +309,16 @@ class Profile:
         if call is not None:
             written |= dict(zip(parameters, call.args, strict=False))
             written |= {word.arg: word.value for word in call.keywords if word.arg is not None}
-        arguments = dict(given)
+        arguments = dict(fixed)
         for name, expression in written.items():
-            if name in given:
+            if name in fixed:
                 continue
             try:
                 arguments[name] = self._evaluated(expression, values)
             except Exception as error:  # the expression needs something that exists in the loop only
                 if name not in parameters or parameters[name].default is inspect.Parameter.empty:
                     raise UserInputError(
-                        f"{self.source.place(expression)}: {ast.unparse(expression)}, the {name} of "
+                        f"{self.source.location(expression)}: {ast.unparse(expression)}, the {name} of "
                         f"{getattr(function, '__name__', function)}(), is known inside of the training loop only "
                         f"({type(error).__name__}), and has no default; {OTHERWISE}"
                     ) from error
@@ -347,10 +349,10 @@ def held_by(module: ModuleType) -> list[tuple[str, Any]]:
 def _changing(model: type) -> set[str]:
     """Return the names of a model's methods that add, remove or reset Gaussians."""
     methods = {n: _names(value) for n, value in inspect.getmembers(model, inspect.isfunction) if not n.startswith("__")}
-    found = set(COUNT_CHANGES) & methods.keys()
-    while more := {name for name, used in methods.items() if used & found} - found:
-        found |= more
-    return found | ({OPACITY_RESET} & methods.keys())
+    changing = set(COUNT_CHANGES) & methods.keys()
+    while more := {name for name, used in methods.items() if used & changing} - changing:
+        changing |= more
+    return changing | ({OPACITY_RESET} & methods.keys())
 
 
 def _names(function: Any) -> set[str]:
@@ -362,8 +364,8 @@ def _names(function: Any) -> set[str]:
 def _attributes_set(function: Any) -> set[str]:
     """Return the names of attributes that a function sets, none for anything else."""
     code = getattr(inspect.unwrap(function), "__code__", None)
-    found = () if code is None else dis.get_instructions(code)
-    return {each.argval for each in found if each.opname == "STORE_ATTR"}
+    instructions = () if code is None else dis.get_instructions(code)
+    return {instruction.argval for instruction in instructions if instruction.opname == "STORE_ATTR"}
 
 
 def _records_no_gradients(node: ast.AST) -> bool:

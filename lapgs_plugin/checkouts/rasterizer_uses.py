@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.checkouts.syntax import executed_on_import, parsed_quietly, place
+from lapgs_plugin.checkouts.syntax import executed_on_import, location, parsed_quietly
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def uses_of_rasterizers(name: str, path: Path, root: Path, modules: Mapping[str,
     """Return how the functions of a module use rasterizers."""
     tree = parsed_quietly(path)
     top = _aliases(executed_on_import(tree.body))
-    found: dict[str, RasterizerUse] = {}
+    uses: dict[str, RasterizerUse] = {}
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         local = _aliases(ast.walk(function))
         scope = {key: alias for key, alias in {**top, **local}.items() if not _wraps(modules.get(alias.module))}
@@ -66,8 +66,8 @@ def uses_of_rasterizers(name: str, path: Path, root: Path, modules: Mapping[str,
         for module in dict.fromkeys(scope[key].module for key in sorted(used)):
             own = {key: scope[key] for key in used if scope[key].module == module}
             use = _use(name, path, root, function, own, any(key in local for key in own))
-            found[module] = _merged(found[module], use) if module in found else use
-    return list(found.values())
+            uses[module] = _merged(uses[module], use) if module in uses else use
+    return list(uses.values())
 
 
 def _wraps(path: Path | None) -> bool:
@@ -92,17 +92,17 @@ class _Alias:
 
 def _aliases(nodes: Iterable[ast.AST]) -> dict[str, _Alias]:
     """Return the names of rasterizers that import statements bind."""
-    found = {}
+    aliases = {}
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             for alias in node.names:
                 if "raster" in alias.name.lower():
-                    found[alias.asname or alias.name] = _Alias(node.module, alias.name, node.lineno)
+                    aliases[alias.asname or alias.name] = _Alias(node.module, alias.name, node.lineno)
         elif isinstance(node, ast.Import):
             for alias in node.names:
                 if "raster" in alias.name.lower():
-                    found[alias.asname or alias.name.partition(".")[0]] = _Alias(alias.name, None, node.lineno)
-    return found
+                    aliases[alias.asname or alias.name.partition(".")[0]] = _Alias(alias.name, None, node.lineno)
+    return aliases
 
 
 def _use(
@@ -113,16 +113,16 @@ def _use(
     names = {_original(node, own) for node in ast.walk(function) if isinstance(node, ast.expr)} - {""}
     settings = [call for call in calls if "setting" in _original(call.func, own).lower()]
     makers = [call for call in calls if _original(call.func, own) and call not in settings]
-    made = {target.id for target in _targets(function, makers) if isinstance(target, ast.Name)}
-    renders = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id in made] or makers
+    rasterizers = {target.id for target in _targets(function, makers) if isinstance(target, ast.Name)}
+    renders = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id in rasterizers] or makers
     outputs = [len(target.elts) for target in _targets(function, renders) if isinstance(target, ast.Tuple)]
     alias = next(iter(own.values()))
     return RasterizerUse(
         module=alias.module,
         names=tuple(sorted(names)),
         holder=holder,
-        where=place(path, root, alias.line),
-        inside=local or any(each.name is None for each in own.values()),
+        where=location(path, root, alias.line),
+        inside=local or any(alias.name is None for alias in own.values()),
         functions=(function.name,),
         settings=frozenset(word.arg for call in settings for word in call.keywords if word.arg is not None),
         inputs=_inputs(function, renders),
@@ -148,14 +148,14 @@ def _targets(function: ast.FunctionDef, calls: list[ast.Call]) -> Iterator[ast.e
 
 def _inputs(function: ast.FunctionDef, renders: list[ast.Call]) -> frozenset[str]:
     """Return the names of the inputs of calls that render, which may be passed as `**inputs`."""
-    found = {word.arg for call in renders for word in call.keywords}
-    if None in found:
+    inputs = {word.arg for call in renders for word in call.keywords}
+    if None in inputs:
         calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
         collecting = [call for call in calls if ast.unparse(call.func).rpartition(".")[2] in ("dict", "update")]
-        found |= {word.arg for call in collecting for word in call.keywords}
+        inputs |= {word.arg for call in collecting for word in call.keywords}
         constants = {node.value for node in ast.walk(function) if isinstance(node, ast.Constant)}
-        found |= {name for name in ("dc", "shs", "colors_precomp") if name in constants}
-    return frozenset(word for word in found if word is not None)
+        inputs |= {name for name in ("dc", "shs", "colors_precomp") if name in constants}
+    return frozenset(word for word in inputs if word is not None)
 
 
 def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:

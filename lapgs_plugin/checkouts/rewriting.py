@@ -34,10 +34,10 @@ class Change(ast.NodeTransformer):
     """Change the tree of a function.
 
     Attributes:
-        found: number of changes, known when the tree was visited.
+        changes: their number, known when the tree was visited.
     """
 
-    found = 0
+    changes = 0
 
 
 def call(name: str, *arguments: ast.expr) -> ast.Call:
@@ -60,9 +60,9 @@ def rewritten(
     tree = tree_of(function)
     if tree is None:
         return function
-    found = change(tree)
-    changed = found.visit(tree)
-    return recompiled(function, changed, names) if found.found else function
+    visitor = change(tree)
+    changed = visitor.visit(tree)
+    return recompiled(function, changed, names) if visitor.changes else function
 
 
 def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
@@ -73,23 +73,23 @@ def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
     """
     if not isinstance(function, FunctionType) or hasattr(function, "__wrapped__"):
         return None
-    made: _Made | None = getattr(function, MADE, None)
-    if made is not None:
-        return copy.deepcopy(made.tree)
+    recompilation: _Made | None = getattr(function, MADE, None)
+    if recompilation is not None:
+        return copy.deepcopy(recompilation.tree)
     path = Path(function.__code__.co_filename)
     if function.__closure__ is not None or not path.is_file():
         return None
-    found = _definition(function, parsed_quietly(path).body)
-    return None if found is None or found.decorator_list else copy.deepcopy(found)
+    definition = _definition(function, parsed_quietly(path).body)
+    return None if definition is None or definition.decorator_list else copy.deepcopy(definition)
 
 
 def _definition(function: FunctionType, body: Sequence[ast.stmt]) -> ast.FunctionDef | None:
     *classes, name = function.__qualname__.split(".")
-    for each in classes:
-        found = (node.body for node in body if isinstance(node, ast.ClassDef) and node.name == each)
-        body = next(found, ())
-    place = name, function.__code__.co_firstlineno
-    functions = (node for node in body if isinstance(node, ast.FunctionDef) and (node.name, node.lineno) == place)
+    for class_name in classes:
+        bodies = (node.body for node in body if isinstance(node, ast.ClassDef) and node.name == class_name)
+        body = next(bodies, ())
+    declared = name, function.__code__.co_firstlineno
+    functions = (node for node in body if isinstance(node, ast.FunctionDef) and (node.name, node.lineno) == declared)
     definition = next(functions, None)
     is_private = definition is not None and any(map(_is_private, ast.walk(definition)))
     return None if classes and is_private else definition
@@ -124,7 +124,7 @@ def recompiled(
     compiled = compile(module, original.__code__.co_filename, "exec", flags, dont_inherit=True)
     defined: dict[str, Any] = {}
     exec(compiled, original.__globals__, defined)
-    made: Callable[..., Any] = defined[FACTORY](*names.values())
-    made.__qualname__ = function.__qualname__
-    setattr(made, MADE, _Made(tree, names))
-    return made
+    recompiled_function: Callable[..., Any] = defined[FACTORY](*names.values())
+    recompiled_function.__qualname__ = function.__qualname__
+    setattr(recompiled_function, MADE, _Made(tree, names))
+    return recompiled_function

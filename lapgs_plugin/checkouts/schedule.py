@@ -91,15 +91,15 @@ class Operand:
         """Elements of a list that is written out."""
         written = self.is_list and isinstance(self.node, (ast.List, ast.Tuple, ast.Set))
         elements = self.node.elts if written else []  # type: ignore[attr-defined]  # as just checked
-        return [Operand(each, False, ast.Eq, self.comparison, each) for each in elements]
+        return [Operand(element, False, ast.Eq, self.comparison, element) for element in elements]
 
     def value(self, variables: Mapping[str, Any]) -> Any:
         """Return its value, None if that is known inside of the loop only."""
         if self.option is not None:
-            found, name = variables.get(self.option[0]), self.option[1]
-            if isinstance(found, Mapping) and name:
-                return found.get(name)
-            return getattr(found, name, None) if name else found
+            holder, name = variables.get(self.option[0]), self.option[1]
+            if isinstance(holder, Mapping) and name:
+                return holder.get(name)
+            return getattr(holder, name, None) if name else holder
         try:
             return ast.literal_eval(self.node)
         except ValueError:
@@ -133,30 +133,30 @@ class Event:
         """Return the event with the values of local variables, by name, in place of the variables."""
 
         def resolve(operands: tuple[Operand, ...]) -> tuple[Operand, ...]:
-            return tuple(replace(each, node=variables.get(ast.unparse(each.written), each.node)) for each in operands)
+            return tuple(replace(one, node=variables.get(ast.unparse(one.written), one.node)) for one in operands)
 
         return replace(self, operands=resolve(self.operands), around=resolve(self.around))
 
     @property
     def period(self) -> Operand | None:
-        return next((each for each in self.operands if each.periodic), None)
+        return next((operand for operand in self.operands if operand.periodic), None)
 
     @property
     def matters(self) -> bool:
         """Whether it is more than logging or the end of the loop."""
-        if all(each.name == "iterations" for each in self.operands):
+        if all(operand.name == "iterations" for operand in self.operands):
             return False
-        numbers = (each.number({}) or 0 for each in (*self.operands, *self.listed))
+        numbers = (operand.number({}) or 0 for operand in (*self.operands, *self.listed))
         return bool(self.calls) or max(numbers) > LOGGING
 
     def never(self, variables: Mapping[str, Any]) -> bool:
         """Return whether it happens at the iterations of a list, which is empty."""
-        return any(each.is_list and each.value(variables) in ([], ()) for each in self.operands)
+        return any(operand.is_list and operand.value(variables) in ([], ()) for operand in self.operands)
 
     @property
     def listed(self) -> tuple[Operand, ...]:
         """Iterations in lists that are written out."""
-        return tuple(element for each in self.operands for element in each.listed)
+        return tuple(element for operand in self.operands for element in operand.listed)
 
     def last(self, end: int, number: Callable[[Operand], int | None]) -> int:
         """Return the last iteration, up to `end`, at which it happens by its period; 0 if there is none."""
@@ -175,11 +175,11 @@ class Event:
     def describe(self, variables: Mapping[str, Any]) -> str:
         """Return one line: the condition, with the values of options that are known, and the functions it calls."""
         known = {
-            _place(each.written): each.value(variables)
-            for each in self.operands
-            if each.option is not None or each.node is not each.written
+            _place(operand.written): operand.value(variables)
+            for operand in self.operands
+            if operand.option is not None or operand.node is not operand.written
         }
-        rewriter = _Rewriter({place: value for place, value in known.items() if value is not None})
+        rewriter = _Rewriter({written: value for written, value in known.items() if value is not None})
         test = rewriter.visit(copy.deepcopy(self.test))
         return f"line {self.test.lineno}: {ast.unparse(test)}" + f" ({', '.join(self.calls)})" * bool(self.calls)
 
@@ -266,10 +266,10 @@ class Schedule:
         late = window.total / RARE
         for event in self.events:
             for operand in event.operands:
-                if operand.is_event_list and operand.name not in keep and (given := operand.value(whole)):
-                    changed.set_list(operand, given, [window.scaled(i) if i > late else i for i in given])
-            found = [*(each for each in event.operands if each.is_bound), *event.listed]
-            bounds = [(each, number) for each in found if (number := each.number(whole) or 0) > late]
+                if operand.is_event_list and operand.name not in keep and (events := operand.value(whole)):
+                    changed.set_list(operand, events, [window.scaled(i) if i > late else i for i in events])
+            operands = [*(operand for operand in event.operands if operand.is_bound), *event.listed]
+            bounds = [(operand, number) for operand in operands if (number := operand.number(whole) or 0) > late]
             for bound, number in bounds:
                 if bound.name not in keep:
                     changed.set(bound, number, window.scaled(number))
@@ -358,7 +358,7 @@ class StageSchedule:
         Args:
             original: the function of the tree, whose globals are used.
         """
-        arguments = {each.arg for each in ast.walk(self._function.args) if isinstance(each, ast.arg)}
+        arguments = {argument.arg for argument in ast.walk(self._function.args) if isinstance(argument, ast.arg)}
         elsewhere = {
             option: tuple(value) if isinstance(value, list) else value
             for option, value in self.options.items()
@@ -383,20 +383,20 @@ class _Rewriter(ast.NodeTransformer):
     def visit(self, node: ast.AST) -> Any:
         if not isinstance(node, ast.expr):
             return self.generic_visit(node)
-        place = _place(node)
-        if place in self.numbers and not isinstance(node, ast.Compare):
-            return ast.copy_location(ast.Constant(self.numbers[place]), node)
+        position = _place(node)
+        if position in self.numbers and not isinstance(node, ast.Compare):
+            return ast.copy_location(ast.Constant(self.numbers[position]), node)
         option = _option(node)
         if option is not None and option in self.options and isinstance(getattr(node, "ctx", None), ast.Load):
             return ast.copy_location(ast.Constant(self.options[option]), node)
-        made = cast("ast.expr", self.generic_visit(node))
-        if place in self.moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
-            at = self.moved[place]
+        visited = cast("ast.expr", self.generic_visit(node))
+        if position in self.moved and isinstance(node, (ast.Compare, ast.UnaryOp)):
+            at = self.moved[position]
             texts = f"{self.variable} < {at}", f"{self.variable} == {at}"
             before, then = (ast.parse(text, mode="eval").body for text in texts)
-            either = ast.BoolOp(ast.Or(), [ast.BoolOp(ast.And(), [made, before]), then])
+            either = ast.BoolOp(ast.Or(), [ast.BoolOp(ast.And(), [visited, before]), then])
             return ast.copy_location(either, node)
-        return made
+        return visited
 
 
 def _option(node: ast.expr) -> tuple[str, str] | None:
@@ -426,19 +426,19 @@ def _iteration_loop(function: ast.FunctionDef) -> tuple[ast.For | None, str]:
 def _constants(function: ast.FunctionDef) -> dict[str, ast.expr]:
     """Return the values of local variables that are set once, to an option, an argument or a number."""
     stored = [node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
-    found: dict[str, ast.expr] = {}
+    constants: dict[str, ast.expr] = {}
     for node in ast.walk(function):
         if not (isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name)):
             continue
         option = _option(node.value)
         known = isinstance(node.value, ast.Constant) if option is None else option[0] not in stored
         if known and stored.count(node.targets[0].id) == 1:
-            found[node.targets[0].id] = node.value
-    return found
+            constants[node.targets[0].id] = node.value
+    return constants
 
 
 def _names(node: ast.AST) -> set[str]:
-    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+    return {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
 
 
 def _events(body: Iterable[ast.AST], variable: str, around: tuple[Operand, ...]) -> Iterator[Event]:
@@ -456,12 +456,12 @@ def _events(body: Iterable[ast.AST], variable: str, around: tuple[Operand, ...])
         elif isinstance(node, (ast.stmt, ast.ExceptHandler, ast.match_case)) and hasattr(node, "body"):
             yield from _events(ast.iter_child_nodes(node), variable, around)
         elif operands := tuple(_operands(node, variable)):
-            yield from (Event(each.comparison, (each,), around, ()) for each in operands)
+            yield from (Event(operand.comparison, (operand,), around, ()) for operand in operands)
 
 
 def _alternatives(test: ast.expr) -> list[ast.expr]:
     if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.Or):
-        return [each for value in test.values for each in _alternatives(value)]
+        return [alternative for value in test.values for alternative in _alternatives(value)]
     return [test]
 
 
@@ -495,7 +495,7 @@ def _divides(node: ast.expr, variable: str) -> bool:
 
 def _calls(body: Iterable[ast.stmt]) -> Iterator[str]:
     """Yield the names of functions that statements call, and of methods of variables: `gaussians.prune`."""
-    for node in (each for statement in body for each in ast.walk(statement)):
+    for node in (part for statement in body for part in ast.walk(statement)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not hasattr(builtins, node.func.id):
             yield node.func.id
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):

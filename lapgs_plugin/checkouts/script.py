@@ -124,4 +124,4 @@ def _is_under(module: ModuleType | None, folder: Path) -> bool:
     known = getattr(module, "__dict__", {})
     package = known.get("__path__")
     places = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
-    return any(isinstance(place, str) and Path(place).is_relative_to(folder) for place in places)
+    return any(isinstance(entry, str) and Path(entry).is_relative_to(folder) for entry in places)

@@ -20,9 +20,9 @@ from lapgs_plugin.checkouts.syntax import (
     called_name,
     called_names,
     executed_on_import,
+    location,
     parsed,
     parsed_quietly,
-    place,
     stored_names,
 )
 from lapgs_plugin.checkouts.training_call import NEEDED, ROLES, lacks_role
@@ -124,17 +124,17 @@ class CheckoutSource:
             UserInputError: it is not Python, or not the training script of a 3DGS checkout; the line says what is
                 missing.
         """
-        given, script = script, script.absolute()
+        typed, script = script, script.absolute()
         known, changed = _READ.get(script, (None, {}))
         if known is not None and _times(changed) == changed:
             return known
-        source = cls._read(script, given)
+        source = cls._read(script, typed)
         files = {script, *source.modules.values()}
         _READ[script] = source, _times({*files, *(file.parent for file in files)})
         return source
 
     @classmethod
-    def _read(cls, script: Path, given: Path) -> CheckoutSource:
+    def _read(cls, script: Path, typed: Path) -> CheckoutSource:
         tree = parsed(script)
         near, training = "", _find_training(tree)
         for root in (script.parent, *script.parent.parents[:FOLDERS_UP]):
@@ -145,12 +145,12 @@ class CheckoutSource:
                 break
         else:
             raise UserInputError(
-                f"{given} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
+                f"{typed} is not the training script of a 3DGS checkout: {near or 'none of its imports'} has a class "
                 f"with {' and '.join(MODEL_ROLES)}; {advice_for(_packages(tree, script))}"
             )
         if training is None:
             raise UserInputError(
-                f"{given} has no function that its main block calls and that calls backward(), expected a function "
+                f"{typed} has no function that its main block calls and that calls backward(), expected a function "
                 f"like training(dataset, opt, pipe, ...); {advice_for(_packages(tree, script))}"
             )
         uses = tuple(use for name, path in modules.items() for use in uses_of_rasterizers(name, path, root, modules))
@@ -164,22 +164,22 @@ class CheckoutSource:
         models = next(filter(None, named), models)
         return cls(script, root, modules, externals, models[0], tuple(models), uses, training)
 
-    def place(self, node: ast.AST) -> str:
+    def location(self, node: ast.AST) -> str:
         """Return the file and line of a node of the script."""
         return f"{self.script.relative_to(self.root)}:{getattr(node, 'lineno', 0)}"
 
     @property
     def model_variable(self) -> str:
         """Name of the training function's variable for the model."""
-        set_up, made, models = list[str](), list[str](), dict(self.models)
+        set_up, assigned, models = list[str](), list[str](), dict(self.models)
         for node in sorted(ast.walk(self.training), key=lambda node: getattr(node, "lineno", 0)):
             if isinstance(node, ast.Attribute) and node.attr == SETUP and isinstance(node.value, ast.Name):
                 set_up.append(node.value.id)
             elif (
                 isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and called_name(node.value) in models
             ):
-                made += [target.id for target in node.targets if isinstance(target, ast.Name)]
-        return next((name for name in set_up if name in made), next(iter((*made, *set_up)), "gaussians"))
+                assigned += [target.id for target in node.targets if isinstance(target, ast.Name)]
+        return next((name for name in set_up if name in assigned), next(iter((*assigned, *set_up)), "gaussians"))
 
     @property
     def model_statements(self) -> list[ast.stmt]:
@@ -189,7 +189,7 @@ class CheckoutSource:
         for node in reversed(body[: next(ends, 0)]):
             if names & stored_names(node):
                 kept.insert(0, node)
-                names |= {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+                names |= {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
         return kept
 
     @property
@@ -198,18 +198,20 @@ class CheckoutSource:
         for path in self.modules.values():
             classes = (node for node in parsed_quietly(path).body if isinstance(node, ast.ClassDef))
             models = (node for node in classes if node.name == self.model[0])
-            for node in (each for model in models for each in ast.walk(model) if isinstance(each, ast.Assign)):
-                if found := SCALES.fullmatch(ast.unparse(node)):
-                    return int(found[1]), place(path, self.root, node.lineno)
+            for node in (
+                statement for model in models for statement in ast.walk(model) if isinstance(statement, ast.Assign)
+            ):
+                if scales := SCALES.fullmatch(ast.unparse(node)):
+                    return int(scales[1]), location(path, self.root, node.lineno)
         return None
 
     @property
     def image_scales(self) -> tuple[str, str] | None:
         """Scales at which the training function asks its scene for images, and the place; None if it asks for one."""
         calls = (node for node in ast.walk(self.training) if isinstance(node, ast.Call))
-        for given in (each.value for call in calls for each in call.keywords if each.arg == SCENE_SCALES):
-            if isinstance(given, (ast.List, ast.Tuple)) and len(given.elts) > 1:
-                return ", ".join(map(ast.unparse, given.elts)), self.place(given)
+        for value in (keyword.value for call in calls for keyword in call.keywords if keyword.arg == SCENE_SCALES):
+            if isinstance(value, (ast.List, ast.Tuple)) and len(value.elts) > 1:
+                return ", ".join(map(ast.unparse, value.elts)), self.location(value)
         return None
 
     def hindrance(self, parameters: Collection[str]) -> str | None:
@@ -222,7 +224,7 @@ class CheckoutSource:
             return f"its Gaussians ({self.model[1]}) have no {', '.join(absent)}, from which fields are archived"
         if (several := self.image_scales) is not None:
             return f"its scene has images at the scales {several[0]} ({several[1]}), and levels have sizes of their own"
-        arguments = [each.arg for each in self.training.args.args]
+        arguments = [argument.arg for argument in self.training.args.args]
         if role := next((role for role in NEEDED if self._is_nested(role, arguments)), None):
             return lacks_role(self.training.name, arguments, role)
         return self.of_finished_model or self._explain_frozen_model(parameters)
@@ -236,17 +238,17 @@ class CheckoutSource:
         functions = [node for node in self._nodes() if isinstance(node, ast.FunctionDef)]
         callers = (node for node in functions if node.name != "restore")  # of a checkpoint
         if not any(SETUP in called_methods(ast.walk(node)) for node in callers):
-            return f"it trains something else than {self.model[0]}: {self.place(self.training)} calls no {SETUP}"
+            return f"it trains something else than {self.model[0]}: {self.location(self.training)} calls no {SETUP}"
         classes = self.classes
-        for node in (each for each in ast.walk(self.training) if isinstance(each, ast.Call)):
+        for node in (call for call in ast.walk(self.training) if isinstance(call, ast.Call)):
             name = called_name(node)
             methods = methods_of(classes[name], classes)[0] if name in classes else {}
             if "__init__" not in methods or not methods.keys() >= set(SCENE_ROLES):
                 continue
-            made, known = methods["__init__"], self.branches.arguments(methods["__init__"], node)
-            possible = called_methods(self.branches.executed(made, known, surely=False))
-            if known.get(FROM_RUN) or (START in called_methods(ast.walk(made)) and START not in possible):
-                return f"it trains on a finished model: {self.place(node)}: {ast.unparse(node)} makes none of points"
+            constructor, known = methods["__init__"], self.branches.arguments(methods["__init__"], node)
+            possible = called_methods(self.branches.executed(constructor, known, surely=False))
+            if known.get(FROM_RUN) or (START in called_methods(ast.walk(constructor)) and START not in possible):
+                return f"it trains on a finished model: {self.location(node)}: {ast.unparse(node)} makes none of points"
         return None
 
     def _explain_frozen_model(self, parameters: Collection[str]) -> str | None:
@@ -275,8 +277,8 @@ class CheckoutSource:
             role: of `training_call.ROLES`.
             parameters: of the training function.
         """
-        nodes = (each for each in ast.walk(self.training) if isinstance(each, ast.Attribute))
-        holders = [ast.unparse(each.value).split(".") for each in nodes if each.attr in ROLES[role]]
+        nodes = (attribute for attribute in ast.walk(self.training) if isinstance(attribute, ast.Attribute))
+        holders = [ast.unparse(attribute.value).split(".") for attribute in nodes if attribute.attr in ROLES[role]]
         depths = [len(names) for names in holders if names[0] in parameters]
         return min(depths, default=1) > 1
 
@@ -339,8 +341,8 @@ def _times(paths: Iterable[Path]) -> dict[Path, int]:
 
 def training_scripts(folder: Path) -> list[Path]:
     """Return files of a folder, and of the folders in it, that may be training scripts: `train.py` first."""
-    found = [*folder.glob("train*.py"), *folder.glob("*/train*.py")]
-    return sorted(found, key=lambda path: (len(path.parts), path.name != "train.py", path))
+    scripts = [*folder.glob("train*.py"), *folder.glob("*/train*.py")]
+    return sorted(scripts, key=lambda path: (len(path.parts), path.name != "train.py", path))
 
 
 def readable_sources(folder: Path) -> tuple[list[CheckoutSource], list[UserInputError]]:
@@ -405,8 +407,8 @@ def _packages(tree: ast.Module, script: Path) -> set[str]:
 
 def _file_of(name: str, folders: Iterable[Path]) -> Path | None:
     for folder in folders:
-        place = folder.joinpath(*name.split("."))
-        for file in (place / "__init__.py", place.with_suffix(".py")):
+        base = folder.joinpath(*name.split("."))
+        for file in (base / "__init__.py", base.with_suffix(".py")):
             if name and file.is_file():
                 return file
     return None
@@ -426,7 +428,7 @@ def _find_models(modules: Mapping[str, Path], root: Path) -> tuple[list[tuple[st
         methods, whole = methods_of(node, nodes)
         if "training_setup" not in methods:
             continue
-        where = place(path, root, node.lineno)
+        where = location(path, root, node.lineno)
         if whole and (lacks := set(MODEL_ROLES) - methods.keys()):
             near = f"{name} in {where} lacks {', '.join(lacks)}, and no other of its imports"
         else:
@@ -440,12 +442,12 @@ def _is(key: ast.expr | None, text: str) -> bool:
 
 def methods_of(node: ast.ClassDef, classes: Mapping[str, ast.ClassDef]) -> tuple[dict[str, ast.FunctionDef], bool]:
     """Return the methods of a class by name, with those of its bases, and whether all bases were found."""
-    methods, whole = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}, True
+    methods, whole = {method.name: method for method in node.body if isinstance(method, ast.FunctionDef)}, True
     for base in node.bases:
         name = base.id if isinstance(base, ast.Name) else base.attr if isinstance(base, ast.Attribute) else ""
         if name in classes and classes[name] is not node:
-            more, found = methods_of(classes[name], classes)
-            methods, whole = more | methods, whole and found
+            more, more_whole = methods_of(classes[name], classes)
+            methods, whole = more | methods, whole and more_whole
         else:
             whole = whole and name in ("object", "Module")
     return methods, whole
@@ -458,8 +460,8 @@ def _find_training(tree: ast.Module) -> ast.FunctionDef | None:
     called = [name for block in blocks for name in called_names(ast.walk(block))]
     # Some main blocks call a function that calls the one that trains.
     called += [name for outer in called if outer in functions for name in called_names(ast.walk(functions[outer]))]
-    found = (functions[name] for name in called if name in functions)
-    return next((each for each in found if "backward" in called_methods(ast.walk(each))), None)
+    candidates = (functions[name] for name in called if name in functions)
+    return next((function for function in candidates if "backward" in called_methods(ast.walk(function))), None)
 
 
 def _externals(modules: Mapping[str, Path], root: Path, needed: Collection[str]) -> Iterator[External]:
@@ -474,8 +476,8 @@ def _externals(modules: Mapping[str, Path], root: Path, needed: Collection[str])
                 imports = {node.module: tuple(alias.name for alias in node.names)}
             else:
                 continue
-            where = place(path, root, node.lineno)
-            for each, names in imports.items():
-                own = each.partition(".")[0] in modules or any(name.startswith(f"{each}.") for name in modules)
-                if each not in modules and not own:
-                    yield External(each, names, where, id(node) not in sure)
+            where = location(path, root, node.lineno)
+            for imported, names in imports.items():
+                own = imported.partition(".")[0] in modules or any(name.startswith(f"{imported}.") for name in modules)
+                if imported not in modules and not own:
+                    yield External(imported, names, where, id(node) not in sure)

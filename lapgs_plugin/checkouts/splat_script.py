@@ -40,12 +40,12 @@ class SplatScript:
         tree = parsed(path)
         statements = list(executed_on_import(tree.body, surely=True))
         froms = [node for node in statements if isinstance(node, ast.ImportFrom) and node.module and not node.level]
-        plain = [each.name for node in statements if isinstance(node, ast.Import) for each in node.names]
+        plain = [alias.name for node in statements if isinstance(node, ast.Import) for alias in node.names]
         modules = {name.partition(".")[0] for name in (*plain, *(str(node.module) for node in froms))}
-        beside = {each.stem for each in path.parent.iterdir()}
+        beside = {entry.stem for entry in path.parent.iterdir()}
         packages = tuple(sorted(modules - sys.stdlib_module_names - beside))
         rasterizes = any(
-            str(node.module).startswith("gsplat") and RASTERIZATION in {each.name for each in node.names}
+            str(node.module).startswith("gsplat") and RASTERIZATION in {alias.name for alias in node.names}
             for node in froms
         )
         trainers = [node for node in tree.body if isinstance(node, ast.ClassDef) and _trains(node)]
@@ -54,5 +54,5 @@ class SplatScript:
 
 def _trains(node: ast.ClassDef) -> bool:
     """Return whether a class has the methods, of which the one that rasterizes calls `RASTERIZATION`."""
-    methods = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+    methods = {method.name: method for method in node.body if isinstance(method, ast.FunctionDef)}
     return methods.keys() >= METHODS and RASTERIZATION in called_names(ast.walk(methods[RASTERIZE]))

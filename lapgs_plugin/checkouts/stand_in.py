@@ -27,17 +27,17 @@ def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     """
     source = readable_source(checkout)
     uses = () if source is None else source.rasterizers
-    modules, places = (dict.fromkeys(each) for each in ([use.module for use in uses], [use.where for use in uses]))
-    known = [name for name, each in VARIANTS.items() if each.module in modules]
+    modules, places = (dict.fromkeys(values) for values in ([use.module for use in uses], [use.where for use in uses]))
+    known = [name for name, variant in VARIANTS.items() if variant.module in modules]
     known.sort(key=lambda name: len(VARIANTS[name].functions) + len(VARIANTS[name].beside))
     names = dict.fromkeys([preferred, *known] if preferred else known)
     lacks = {name: {} if source is None else dict.fromkeys(_lacks(name, source)) for name in names}
     near = min(lacks, key=lambda name: len(lacks[name]), default="")
-    found = [*lacks.get(near, ()), *dict.fromkeys(_unreturned(near, uses))]
-    if near and not found:
+    faults = [*lacks.get(near, ()), *dict.fromkeys(_unreturned(near, uses))]
+    if near and not faults:
         return near
-    verbs = dict.fromkeys(verb for verb, _ in found)
-    parts = [f"{verb} {', '.join(what for each, what in found if each == verb)}" for verb in verbs]
+    verbs = dict.fromkeys(verb for verb, _ in faults)
+    parts = [f"{verb} {', '.join(what for of_verb, what in faults if of_verb == verb)}" for verb in verbs]
     why = f"; the nearest, {near}, {' and '.join(parts)}" if near else ""
     raise MissingExtraError(
         f"lapgs has no rasterizer in place of {', '.join(modules) or 'the compiled one'}, imported in "
@@ -54,15 +54,15 @@ def _lacks(variant: str, source: CheckoutSource) -> Iterator[tuple[str, str]]:
             absent = set(one.names) - rasterizer_module(offered[one.name]).keys() - {"_C"}
             yield from (("has no", name) for name in sorted(absent))
     for use in source.rasterizers:
-        each = VARIANTS.get(offered.get(use.module, ""))
-        if each is None:
+        near = VARIANTS.get(offered.get(use.module, ""))
+        if near is None:
             yield "has no", use.module
             continue
-        if not each.settings:  # a module of functions
+        if not near.settings:  # a module of functions
             continue
-        for name in sorted(use.settings - set(each.settings)):
+        for name in sorted(use.settings - set(near.settings)):
             yield "takes no setting", name
-        for name in sorted(set(each.settings) - use.settings if use.settings else ()):
+        for name in sorted(set(near.settings) - use.settings if use.settings else ()):
             yield "wants the setting", name
         forward = rasterizer_module(offered[use.module])["GaussianRasterizer"].forward
         for name in sorted(use.inputs - set(inspect.signature(forward).parameters) - OPTIONAL_INPUTS):
@@ -80,4 +80,4 @@ def _unreturned(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[tuple[s
 
 def _offered(variant: str) -> dict[str, str]:
     """Return a variant and those beside it by their modules."""
-    return {VARIANTS[each].module: each for each in (variant, *VARIANTS[variant].beside)}
+    return {VARIANTS[name].module: name for name in (variant, *VARIANTS[variant].beside)}

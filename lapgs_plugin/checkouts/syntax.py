@@ -58,23 +58,23 @@ def plain_assignments(function: ast.FunctionDef) -> list[ast.stmt]:
 def _only_assigns(node: ast.stmt) -> bool:
     nodes = list(ast.walk(node))
     kept = (ast.Assign, ast.AnnAssign, ast.If, ast.Pass)
-    acts = any(isinstance(each, (ast.Call, ast.Await, ast.Yield, ast.YieldFrom)) for each in nodes)
-    targets = [each for each in nodes if isinstance(getattr(each, "ctx", None), ast.Store)]
+    acts = any(isinstance(part, (ast.Call, ast.Await, ast.Yield, ast.YieldFrom)) for part in nodes)
+    targets = [target for target in nodes if isinstance(getattr(target, "ctx", None), ast.Store)]
     return (
         not acts
-        and all(isinstance(each, kept) for each in nodes if isinstance(each, ast.stmt))
-        and all(isinstance(each, (ast.Name, ast.Tuple)) for each in targets)
+        and all(isinstance(statement, kept) for statement in nodes if isinstance(statement, ast.stmt))
+        and all(isinstance(target, (ast.Name, ast.Tuple)) for target in targets)
     )
 
 
 def stored_names(node: ast.AST) -> set[str]:
     """Return the names of variables that a node sets or imports."""
     nodes = list(ast.walk(node))
-    imported = {(each.asname or each.name).partition(".")[0] for each in nodes if isinstance(each, ast.alias)}
-    return imported | {each.id for each in nodes if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
+    imported = {(alias.asname or alias.name).partition(".")[0] for alias in nodes if isinstance(alias, ast.alias)}
+    return imported | {name.id for name in nodes if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)}
 
 
-def place(path: Path, root: Path, line: int) -> str:
+def location(path: Path, root: Path, line: int) -> str:
     """Return a line of a file as `file:line`, relative to the checkout's root if the file is below it."""
     return f"{path.relative_to(root) if path.is_relative_to(root) else path}:{line}"
 

@@ -76,16 +76,16 @@ class TrainingCall:
                     "name; `lapgs run --off` runs the script as it is"
                 )
         names = sorted(values, key=lambda name: isinstance(values[name], Namespace))
-        found = {
+        roles = {
             role: next((name for name in names if any(hasattr(values[name], a) for a in attributes)), None)
             for role, attributes in ROLES.items()
         }
         for role in NEEDED:
-            if found[role] is None:
+            if roles[role] is None:
                 raise UserInputError(
                     f"{lacks_role(function.__name__, values, role)}; `lapgs run --off` runs the script as it is"
                 )
-        return cls(function, values, {role: name for role, name in found.items() if name is not None})
+        return cls(function, values, {role: name for role, name in roles.items() if name is not None})
 
     @property
     def dataset(self) -> Any:
@@ -103,12 +103,12 @@ class TrainingCall:
     @property
     def checkpoint(self) -> Any:
         """Checkpoint to start from, if the script takes one."""
-        return next((given[name] for given in self._named for name in CHECKPOINTS if name in given), None)
+        return next((arguments[name] for arguments in self._named for name in CHECKPOINTS if name in arguments), None)
 
     @property
     def test_iterations(self) -> Sequence[int]:
         """Iterations after which the script measures its views."""
-        lists = (each for given in self._named for each in _iteration_lists(given))
+        lists = (iterations for arguments in self._named for iterations in _iteration_lists(arguments))
         return next((iterations for name, iterations in lists if name.startswith("test")), ())
 
     @property
@@ -159,15 +159,15 @@ class TrainingCall:
         """
         variables = getattr(inspect.unwrap(self.function), "__globals__", {})
         parsed = [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
-        kept = [(each, each.model_path) for each in parsed if hasattr(each, "model_path")]
+        kept = [(group, group.model_path) for group in parsed if hasattr(group, "model_path")]
         folder = getattr(self.dataset, "model_path", None)
         try:
-            for each, _ in kept:
-                each.model_path = folder
+            for group, _ in kept:
+                group.model_path = folder
             yield
         finally:
-            for each, before in reversed(kept):
-                each.model_path = before
+            for group, before in reversed(kept):
+                group.model_path = before
 
 
 def _iteration_lists(values: Mapping[str, Any]) -> list[tuple[str, Sequence[int]]]:

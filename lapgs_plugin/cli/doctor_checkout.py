@@ -42,7 +42,7 @@ def describe(path: Path) -> dict[str, list[Finding]]:
         "Checkout": [
             Finding("Root", "ok", str(source.root)),
             Finding("Adapter", "ok", f"{adapter.info.title} (--backbone {adapter.info.name})"),
-            Finding("Training", "ok", f"{source.place(source.training)}: {source.training.name}({parameters})"),
+            Finding("Training", "ok", f"{source.location(source.training)}: {source.training.name}({parameters})"),
             *others,
             Finding("Gaussians", "ok", _gaussians(source)),
         ],
@@ -105,7 +105,7 @@ def _gaussians(source: CheckoutSource) -> str:
     """Return the class of the Gaussians with its file, or all that the script may choose."""
     if len(source.models) == 1:
         return f"{source.model[1]}: {source.model[0]}"
-    choice = [f"{source.place(node)} chooses: {ast.unparse(node)}" for node in source.model_statements[-1:]]
+    choice = [f"{source.location(node)} chooses: {ast.unparse(node)}" for node in source.model_statements[-1:]]
     return "; ".join([", ".join(f"{where}: {name}" for name, where in source.models), *choice])
 
 

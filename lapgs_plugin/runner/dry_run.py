@@ -297,7 +297,7 @@ class DryRun:
     @property
     def _training_place(self) -> str:
         source = self._adapter.profile.source
-        return source.place(source.training)
+        return source.location(source.training)
 
     @torch.no_grad()
     def _evaluate(self, view: Any, image: Tensor) -> None:

@@ -116,7 +116,7 @@ class _Replacing(Change):
     """Replace expressions by calls."""
 
     def _call(self, name: str, argument: ast.expr) -> ast.Call:
-        self.found += 1
+        self.changes += 1
         return ast.copy_location(call(name, argument), argument)
 
 

@@ -117,8 +117,8 @@ def reading_late(training: Callable[..., Any]) -> Callable[..., Any]:
 
     def late(tree: ast.FunctionDef) -> LateNumbers:
         change = LateNumbers(tree, parsed(Path(inspect.getfile(training))))
-        if change.found:
-            logger.info("%d numbers that %s only logs are read when they are shown", change.found, training.__name__)
+        if change.changes:
+            logger.info("%d numbers that %s only logs are read when they are shown", change.changes, training.__name__)
         return change
 
     return rewritten(training, late, NAMES)
