@@ -101,8 +101,8 @@ class BackboneAdapter:
     @property
     def rasterizer(self) -> str:
         """Module that the training loop renders with."""
-        found = self.profile.rasterizers
-        return found[0].use.module if found else self.info.rasterizer
+        rasterizers = self.profile.rasterizers
+        return rasterizers[0].use.module if rasterizers else self.info.rasterizer
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -388,8 +388,8 @@ class BackboneAdapter:
 
     def optimizers(self, gaussians: Any) -> list[torch.optim.Optimizer]:
         """Return the optimizers that step Gaussians."""
-        found = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
-        return [optimizer for optimizer in found if optimizer is not None]
+        candidates = (getattr(gaussians, name, None) for name in ("optimizer", "shoptimizer"))
+        return [optimizer for optimizer in candidates if optimizer is not None]
 
 
 def logits_of(opacities: Tensor) -> Tensor:

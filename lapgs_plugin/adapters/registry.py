@@ -46,8 +46,8 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
     Raises:
         UserInputError: an installed package's cannot be loaded, or has another name; the line names it.
     """
-    found = {name: BACKBONES[name] for name in BACKBONES}
-    for name, adapter in found.items():
+    adapters = {name: BACKBONES[name] for name in BACKBONES}
+    for name, adapter in adapters.items():
         if not isinstance(getattr(adapter, "info", None), BackboneInfo):
             raise UserInputError(
                 f"--backbone {name}: {adapter.__module__}.{adapter.__qualname__} has no BackboneInfo called info; fix "
@@ -58,7 +58,7 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
                 f"--backbone {name}: the info of {adapter.__module__}.{adapter.__qualname__} has the name "
                 f"{adapter.info.name}, expected {name}; fix or uninstall the package that brings it"
             )
-    return tuple(found.values())
+    return tuple(adapters.values())
 
 
 def recognise(folder: Path) -> type[BackboneAdapter] | None:
@@ -70,12 +70,12 @@ def recognise(folder: Path) -> type[BackboneAdapter] | None:
     Raises:
         UserInputError: several are left, or an installed package's cannot be loaded.
     """
-    found = [each for each in all_adapters() if each.recognises(folder)]
-    if not found and readable_source(folder) is not None:
+    recognising = [adapter for adapter in all_adapters() if adapter.recognises(folder)]
+    if not recognising and readable_source(folder) is not None:
         return GenericAdapter
-    left = [each for each in found if not any(other.info.is_fork_of(each.info) for other in found)]
+    left = [adapter for adapter in recognising if not any(other.info.is_fork_of(adapter.info) for other in recognising)]
     if len(left) > 1:
-        names = " and ".join(each.info.name for each in left)
+        names = " and ".join(adapter.info.name for adapter in left)
         raise UserInputError(f"{folder} is recognised as a checkout of {names}; choose one with --backbone")
     return left[0] if left else None
 
@@ -99,28 +99,28 @@ def adapter_class(folder: Path, name: str | None = None) -> type[BackboneAdapter
                 f"it out, or take {GENERIC} for any fork"
             )
         return chosen
-    found = recognise(folder)
-    if found is None:
+    adapter = recognise(folder)
+    if adapter is None:
         raise UserInputError(
             f"{folder} is not the root of a 3DGS checkout: none of its train*.py imports a class of Gaussians; "
             "expected a checkout, whose train.py `lapgs run` is given; `lapgs train` trains without one"
         )
-    return found
+    return adapter
 
 
 def known_extensions() -> dict[str, str]:
     """Return the compiled modules that the backbones' training scripts import, each with its purpose."""
     users: dict[tuple[str, str], list[str]] = {}
-    for each in all_adapters():
-        for module, purpose in each.info.extensions.items():
-            users.setdefault((module, purpose), []).append(each.info.title)
+    for adapter in all_adapters():
+        for module, purpose in adapter.info.extensions.items():
+            users.setdefault((module, purpose), []).append(adapter.info.title)
     return {module: f"{purpose} of {', '.join(titles)}" for (module, purpose), titles in users.items()}
 
 
 def rasterizer_owners() -> dict[str, type[BackboneAdapter]]:
     """Return the adapter that describes each CUDA rasterizer, by the name of the rasterizer's module."""
     owners: dict[str, type[BackboneAdapter]] = {}
-    for each in all_adapters():
-        if each.rasterizer_semantics() is not None:
-            owners.setdefault(each.info.rasterizer, each)
+    for adapter in all_adapters():
+        if adapter.rasterizer_semantics() is not None:
+            owners.setdefault(adapter.info.rasterizer, adapter)
     return owners

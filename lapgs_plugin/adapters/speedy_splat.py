@@ -48,8 +48,8 @@ class Adapter(BackboneAdapter):
 
         of_view = torch.zeros_like(scores, requires_grad=True)
         image = self.train.render(view, gaussians, pipeline, background, scores=of_view)["render"]
-        (found,) = torch.autograd.grad(image.sum(), of_view)
-        scores += found
+        (gradient,) = torch.autograd.grad(image.sum(), of_view)
+        scores += gradient
 
 
 def _when_complete(elapsed_time: Callable[[Any, Any], float]) -> Callable[[Any, Any], float]:

@@ -101,8 +101,8 @@ class Adapter(BackboneAdapter):
 
     def _budget(self, call: TrainingCall, window: StageWindow) -> int:
         """Return the number of Gaussians that a stage may grow to."""
-        given = call.values["args"]
-        whole = given.budget * self._points if given.mode == "multiplier" else given.budget
+        args = call.values["args"]
+        whole = args.budget * self._points if args.mode == "multiplier" else args.budget
         progress = 1 - window.stage.level / (window.levels - 1)  # 0 for the base, 1 for the finest
         return int(whole * (BASE_SHARE + (FINEST_SHARE - BASE_SHARE) * progress))
 

@@ -46,7 +46,7 @@ class LateNumbers(Change):
         script: its module, for functions that are given numbers.
 
     Attributes:
-        found: number of reads that are late.
+        changes: number of reads that are late.
     """
 
     def __init__(self, function: ast.FunctionDef, script: ast.Module) -> None:

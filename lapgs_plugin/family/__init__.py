@@ -38,24 +38,24 @@ def stand_ins(variant: str, *, neighbours: bool = False) -> dict[str, ModuleType
     names = variant, *_known(variant).beside
     ssim = {"fusedssim": fused_ssim.fusedssim, "fusedssim_backward": fused_ssim.fusedssim_backward}
     knn = distances_and_neighbours if neighbours else mean_squared_distance
-    found = {}
-    for each in names:
-        name = VARIANTS[each].module
+    modules = {}
+    for member in names:
+        name = VARIANTS[member].module
         for parent in _parents(name):
-            found[parent] = _module(parent, {}, package=True)
-        found[name] = _module(name, rasterizer_module(each), package=True)
-        found[f"{name}._C"] = _module(f"{name}._C", ssim if VARIANTS[each].fused_ssim else {})
-    found |= {
+            modules[parent] = _module(parent, {}, package=True)
+        modules[name] = _module(name, rasterizer_module(member), package=True)
+        modules[f"{name}._C"] = _module(f"{name}._C", ssim if VARIANTS[member].fused_ssim else {})
+    modules |= {
         "simple_knn": _module("simple_knn", {}, package=True),
         # With fewer than four points the mean is over those that exist, where the CUDA code returns infinity.
         "simple_knn._C": _module("simple_knn._C", {"distCUDA2": knn}),
         "fused_ssim": _module("fused_ssim", {name: vars(fused_ssim)[name] for name in ("fused_ssim", "fused_ssim_")}),
     }
-    for full, module in found.items():
+    for full, module in modules.items():
         parent, _, child = full.rpartition(".")
         if parent:
-            setattr(found[parent], child, module)
-    return found
+            setattr(modules[parent], child, module)
+    return modules
 
 
 def unavailable(variant: str) -> str:
@@ -88,15 +88,15 @@ def install(variant: str, *, neighbours: bool = False) -> Iterator[dict[str, Mod
     Raises:
         UserInputError: there is no such variant, or a CUDA module of the same name is already imported.
     """
-    found = stand_ins(variant, neighbours=neighbours)
-    taken = sorted(found.keys() & sys.modules.keys())
+    modules = stand_ins(variant, neighbours=neighbours)
+    taken = sorted(modules.keys() & sys.modules.keys())
     if taken:
         raise UserInputError(f"{taken[0]} is already imported; install stand-ins before the checkout's modules")
-    sys.modules.update(found)
+    sys.modules.update(modules)
     try:
-        yield found
+        yield modules
     finally:
-        for name, module in found.items():
+        for name, module in modules.items():
             if sys.modules.get(name) is module:
                 del sys.modules[name]
 

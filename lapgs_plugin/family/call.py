@@ -155,9 +155,9 @@ class Output:
 
     def sum(self, name: str) -> Tensor:
         """Return one of the sums that were asked for."""
-        found: Tensor | None = getattr(self.contributions, name)
-        assert found is not None, f"{name} is not among the sums of the call's options"
-        return found
+        value: Tensor | None = getattr(self.contributions, name)
+        assert value is not None, f"{name} is not among the sums of the call's options"
+        return value
 
 
 def depths_of(means: Tensor, viewmatrix: Tensor) -> Tensor:

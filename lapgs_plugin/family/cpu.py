@@ -64,10 +64,10 @@ def view_of(settings: Settings, blur: float) -> View:
     full = settings.projmatrix.detach().to("cpu", torch.float64).T.numpy()
     projection = full[:, :3] @ np.linalg.inv(world_to_camera[:3, :3])  # (4, 3)
     focal = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
-    found = projection[0, 0] * width / 2, projection[1, 1] * height / 2
-    if not np.allclose(found, focal, rtol=FOCAL_TOLERANCE) or not np.allclose(projection[3], (0, 0, 1), atol=1e-3):
+    of_matrix = projection[0, 0] * width / 2, projection[1, 1] * height / 2
+    if not np.allclose(of_matrix, focal, rtol=FOCAL_TOLERANCE) or not np.allclose(projection[3], (0, 0, 1), atol=1e-3):
         raise UserInputError(
-            f"projmatrix has focal lengths {found[0]:.6g}, {found[1]:.6g} px, but tanfovx and tanfovy say "
+            f"projmatrix has focal lengths {of_matrix[0]:.6g}, {of_matrix[1]:.6g} px, but tanfovx and tanfovy say "
             f"{focal[0]:.6g}, {focal[1]:.6g}; pass the transposed projection times viewmatrix for this image size"
         )
     principal = (1 + projection[0, 2]) * width / 2, (1 + projection[1, 2]) * height / 2
@@ -87,19 +87,19 @@ class _Call:
 
     def gaussians(self, tensors: Sequence[Tensor | None]) -> Gaussians:
         """Return the tensors of `Inputs` as the kernels take them."""
-        given = Inputs._make(None if t is None else t.detach().contiguous() for t in tensors)
-        sh = given.sh if given.dc is None or given.sh is None else torch.cat([given.dc, given.sh], 1)
-        scales, quats = given.scales, given.quats
-        if given.covariances is not None:
-            scales, quats = principal_axes(given.covariances)
+        detached = Inputs._make(None if t is None else t.detach().contiguous() for t in tensors)
+        sh = detached.sh if detached.dc is None or detached.sh is None else torch.cat([detached.dc, detached.sh], 1)
+        scales, quats = detached.scales, detached.quats
+        if detached.covariances is not None:
+            scales, quats = principal_axes(detached.covariances)
         elif scales is not None and self.settings.scale_modifier != 1:
             scales = scales * self.settings.scale_modifier
         assert scales is not None
         assert quats is not None
         degree = int(self.settings.sh_degree)
         return Gaussians(
-            given.means.numpy(), quats.numpy(), scales.numpy(), given.opacities.reshape(-1).numpy(),
-            None if sh is None else sh.numpy(), None if given.colors is None else given.colors.numpy(),
+            detached.means.numpy(), quats.numpy(), scales.numpy(), detached.opacities.reshape(-1).numpy(),
+            None if sh is None else sh.numpy(), None if detached.colors is None else detached.colors.numpy(),
             raw=False, signed=degree < 0, sh_degree=degree & ~SIGNED_COLOR_BIT,
         )  # fmt: skip
 
@@ -126,9 +126,9 @@ def _contributions(call: _Call, rendering: Rendering) -> Contributions:
     pixels = call.view.width * call.view.height
     flat = torch.ones(pixels) if weights is None else weights.detach().to("cpu", torch.float32).reshape(-1)
     sums = sums_of(len(rendering.radii), call.view, rendering.kept, flat.contiguous().numpy())
-    found = {name: torch.from_numpy(values).float() for name, values in zip(SUMS, sums, strict=True)}
-    found["counts"] = found["counts"].int()
-    return Contributions(**{name: found[name] for name in call.options.sums})
+    contributions = {name: torch.from_numpy(values).float() for name, values in zip(SUMS, sums, strict=True)}
+    contributions["counts"] = contributions["counts"].int()
+    return Contributions(**{name: contributions[name] for name in call.options.sums})
 
 
 class _Blending(Blending):
@@ -196,48 +196,50 @@ class _Rasterize(torch.autograd.Function):
             shaded = call.shaded_by_depth(call.gaussians(tensors))
             rendering = call.render(shaded, np.zeros(3, np.float32), True)
             grad = torch.cat([grad_depth, torch.zeros(2, *grad_depth.shape[1:])])
-            found = _gradients(call, tensors, shaded, rendering, grad)
-            by_inverse, found[3:6] = found[5], [None, None, None]
+            gradients = _gradients(call, tensors, shaded, rendering, grad)
+            by_inverse, gradients[3:6] = gradients[5], [None, None, None]
             assert by_inverse is not None
-            assert found[0] is not None
+            assert gradients[0] is not None
             axis = call.settings.viewmatrix.detach().cpu()[:3, 2]
             inverse = torch.from_numpy(shaded.colors)[:, :1]  # (n, 1)
-            found[0] = found[0] - by_inverse[:, :1] * inverse**2 * axis
-            total = _add(total, found)
+            gradients[0] = gradients[0] - by_inverse[:, :1] * inverse**2 * axis
+            total = _add(total, gradients)
         return (None, *total)
 
 
 def _gradients(
-    call: _Call, given: Inputs, gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
+    call: _Call, inputs: Inputs, gaussians: Gaussians, rendering: Rendering, grad_image: Tensor
 ) -> list[Tensor | None]:
     """Return gradients in the order of `Inputs`; that by colours whenever `gaussians` has colours."""
-    found = pipeline.gradients(gaussians, call.view, rendering, grad_image.contiguous().numpy(), None)
+    gradients = pipeline.gradients(gaussians, call.view, rendering, grad_image.contiguous().numpy(), None)
     by_covariances = None
-    if given.covariances is not None:
+    if inputs.covariances is not None:
         assert rendering.kept is not None
-        by_covariances = covariance_gradients(given.means, given.covariances, call.view, rendering.kept, found.slots)
-    by_sh = None if found.sh is None else torch.from_numpy(found.sh)
-    by_dc = None if by_sh is None or given.dc is None else by_sh[:, :1]
+        by_covariances = covariance_gradients(
+            inputs.means, inputs.covariances, call.view, rendering.kept, gradients.slots
+        )
+    by_sh = None if gradients.sh is None else torch.from_numpy(gradients.sh)
+    by_dc = None if by_sh is None or inputs.dc is None else by_sh[:, :1]
     return [
-        torch.from_numpy(found.means),
-        _screen_gradient(call.view, found, given.means2d),
-        torch.from_numpy(found.opacities)[:, None],
+        torch.from_numpy(gradients.means),
+        _screen_gradient(call.view, gradients, inputs.means2d),
+        torch.from_numpy(gradients.opacities)[:, None],
         by_dc,
         by_sh if by_sh is None or by_dc is None else by_sh[:, 1:],
-        None if found.colors is None else torch.from_numpy(found.colors),
-        None if given.covariances is not None else torch.from_numpy(found.scales),
-        None if given.covariances is not None else torch.from_numpy(found.quats),
+        None if gradients.colors is None else torch.from_numpy(gradients.colors),
+        None if inputs.covariances is not None else torch.from_numpy(gradients.scales),
+        None if inputs.covariances is not None else torch.from_numpy(gradients.quats),
         by_covariances,
     ]
 
 
-def _screen_gradient(view: View, found: Gradients, means2d: Tensor) -> Tensor:
+def _screen_gradient(view: View, gradients: Gradients, means2d: Tensor) -> Tensor:
     """Return the gradient by the centres in units of half the image; of four columns the last two are absolute sums."""
     half = np.array([view.width / 2, view.height / 2], np.float32)
     gradient = torch.zeros_like(means2d)
-    gradient[:, :2] = torch.from_numpy(found.centres * half)
+    gradient[:, :2] = torch.from_numpy(gradients.centres * half)
     if means2d.shape[1] == 4:
-        gradient[:, 2:] = torch.from_numpy(found.absolute_centres * half)
+        gradient[:, 2:] = torch.from_numpy(gradients.absolute_centres * half)
     return gradient
 
 

@@ -63,8 +63,8 @@ class _Scored(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor) -> tuple[Tensor | None, ...]:
-        found: Tensor = ctx.blending.squared_gradients(grad_image.reshape(3, -1))
-        return grad_image, found[:, None], None
+        squared: Tensor = ctx.blending.squared_gradients(grad_image.reshape(3, -1))
+        return grad_image, squared[:, None], None
 
 
 class MiniSplatting(WholeSh):
@@ -370,28 +370,28 @@ def diff_rasterize(
         opacities: (n, 1) logits.
         densification_info: (2, n), changed by the backward pass.
     """
-    given = rasterizer_settings
-    tan_x, tan_y = given.width / (2 * given.focal_x), given.height / (2 * given.focal_y)
+    camera = rasterizer_settings
+    tan_x, tan_y = camera.width / (2 * camera.focal_x), camera.height / (2 * camera.focal_y)
     projection = _matrix(
         means.device,
-        (1 / tan_x, 0.0, 2 * given.center_x / given.width - 1, 0.0),
-        (0.0, 1 / tan_y, 2 * given.center_y / given.height - 1, 0.0),
-        (0.0, 0.0, 1.0, -given.near_plane),
+        (1 / tan_x, 0.0, 2 * camera.center_x / camera.width - 1, 0.0),
+        (0.0, 1 / tan_y, 2 * camera.center_y / camera.height - 1, 0.0),
+        (0.0, 0.0, 1.0, -camera.near_plane),
         (0.0, 0.0, 1.0, 0.0),
     )
     last = _matrix(means.device, (0.0, 0.0, 0.0, 1.0))
-    pose = given.w2c if len(given.w2c) == 4 else torch.cat([given.w2c, last])
+    pose = camera.w2c if len(camera.w2c) == 4 else torch.cat([camera.w2c, last])
     settings: Any = SimpleNamespace(
-        image_height=given.height, image_width=given.width, tanfovx=tan_x, tanfovy=tan_y, bg=given.bg_color,
+        image_height=camera.height, image_width=camera.width, tanfovx=tan_x, tanfovy=tan_y, bg=camera.bg_color,
         scale_modifier=1.0, viewmatrix=pose.T, projmatrix=(projection @ pose).T,
-        sh_degree=math.isqrt(given.active_sh_bases) - 1, campos=given.cam_position,
+        sh_degree=math.isqrt(camera.active_sh_bases) - 1, campos=camera.cam_position,
     )  # fmt: skip
     points = torch.zeros_like(means, requires_grad=True)
     inputs = Inputs(
         means, points, opacities.sigmoid(), sh_coefficients_0, sh_coefficients_rest, None, scales.exp(),
         normalize(rotations), None,
     )  # fmt: skip
-    output = rasterize(settings, inputs, Options(antialiasing=given.proper_antialiasing))
+    output = rasterize(settings, inputs, Options(antialiasing=camera.proper_antialiasing))
 
     def note(gradient: Tensor) -> None:
         if len(densification_info):

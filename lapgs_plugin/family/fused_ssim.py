@@ -50,8 +50,8 @@ def fusedssim_backward(c1: float, c2: float, img1: Tensor, img2: Tensor, grad_ma
     _check_constants(c1, c2)
     leaf = img1.detach().requires_grad_(True)
     with torch.enable_grad():
-        found = ssim_map(leaf, img2.detach())
-    return torch.autograd.grad(found, leaf, grad_map)[0]
+        similarity = ssim_map(leaf, img2.detach())
+    return torch.autograd.grad(similarity, leaf, grad_map)[0]
 
 
 def _check_constants(c1: float, c2: float) -> None:

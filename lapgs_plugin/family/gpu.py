@@ -163,12 +163,12 @@ class _Rasterize(torch.autograd.Function):
         # Most losses do not use depths, which take a third of the time of blending's backward pass.
         rules = call.rules._replace(depth=call.rules.depth and by_depths is not None)
         depths = (inverse_depths, by_depths.contiguous()) if rules.depth and by_depths is not None else None
-        found, others = blend_backward(
+        by_records, others = blend_backward(
             records, offsets, flat, image, counts, words, by_image, call.columns == 4, rules=rules,
             inverse_depths=depths,
         )  # fmt: skip
         by, by_first, by_screen = project_family_backward(
-            parameters, first, call.camera, call.degree, call.signed, radii, records, found, others, rules,
+            parameters, first, call.camera, call.degree, call.signed, radii, records, by_records, others, rules,
             call.numbers, call.columns,
         )  # fmt: skip
         from_axes, colored = not call.rules.covariances, parameters.sh.ndim == 2

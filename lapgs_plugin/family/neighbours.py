@@ -16,9 +16,9 @@ def distances_and_neighbours(points: Tensor) -> tuple[Tensor, Tensor]:
     With fewer than four points, those that do not exist are 0.
     """
     positions, count = points.detach().to("cpu", torch.float64).numpy(), min(NEIGHBOURS + 1, len(points))
-    found = cKDTree(positions).query(positions, k=range(1, count + 1))[1]  # (n, count)
-    others = found != np.arange(len(found))[:, None]
+    nearest = cKDTree(positions).query(positions, k=range(1, count + 1))[1]  # (n, count)
+    others = nearest != np.arange(len(nearest))[:, None]
     others[others.all(1), -1] = False  # points at the same position were found instead of the point itself
     neighbours = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32)
-    neighbours[:, : count - 1] = torch.from_numpy(found[others].reshape(len(points), count - 1))
+    neighbours[:, : count - 1] = torch.from_numpy(nearest[others].reshape(len(points), count - 1))
     return mean_squared_distance(points), neighbours.to(points.device)

@@ -269,16 +269,16 @@ VARIANTS = {**BACKBONES, **FORKS}
 def rasterizer_module(name: str) -> dict[str, Any]:
     """Return the public names of the stand-in for a variant's module; always the same classes."""
     variant = VARIANTS[name]
-    found: dict[str, Any] = {"__doc__": variant.description}
-    found |= {each.__name__: each for each in variant.functions}
+    contents: dict[str, Any] = {"__doc__": variant.description}
+    contents |= {function.__name__: function for function in variant.functions}
     if not variant.settings:
-        return found
-    found |= {
+        return contents
+    contents |= {
         "GaussianRasterizationSettings": namedtuple("GaussianRasterizationSettings", variant.settings),
         "GaussianRasterizer": type(
             "GaussianRasterizer", (variant.binding,), {"variant": variant, "__doc__": Rasterizer.__doc__}
         ),
     }
     if variant.sparse_adam:
-        found["SparseGaussianAdam"] = SparseGaussianAdam
-    return found
+        contents["SparseGaussianAdam"] = SparseGaussianAdam
+    return contents

@@ -334,17 +334,17 @@ def blend_backward(
     assert len(counts) == programs
     count, stride = records.numel() // RECORD, OTHERS[absolute, rules.depth]
     zeros = records.new_zeros((GRADIENT + stride) * count)  # in one launch
-    found, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
+    gradients, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
     launch(
         _backward_kernel, (programs,),
-        records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)), found, others,
-        flat.new_empty(programs, QUEUE.value), *numbers,
+        records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)),
+        gradients, others, flat.new_empty(programs, QUEUE.value), *numbers,
         rows=shape.rows, splats=shape.splats, tile=TILE, record=RECORD,
         absolute=absolute, family=rules.family, depth=rules.depth, stride=stride, num_warps=1,
         **at_most(BACKWARD_REGISTERS),
     )  # fmt: skip
     leading = records.shape[:-1]
-    return found.view(*leading, GRADIENT), others.view(*leading, stride)
+    return gradients.view(*leading, GRADIENT), others.view(*leading, stride)
 
 
 def _size_of(images: Tensor, rules: Rules) -> tuple[int, int]:

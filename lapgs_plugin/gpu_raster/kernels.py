@@ -467,7 +467,8 @@ def _by_depth(
 @triton.jit(do_not_specialize=("width", "height", "n", "cameras"))
 def _shape_gradient_kernel(
     means: tl.tensor, quaternions: tl.tensor, scales: tl.tensor, opacities: tl.tensor,
-    poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor, found: tl.tensor, others: tl.tensor,
+    poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor,
+    by_records: tl.tensor, others: tl.tensor,
     by_mean: tl.tensor, by_quaternion: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
     by_color: tl.tensor, by_screen: tl.tensor,
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float, closest: float,
@@ -489,8 +490,8 @@ def _shape_gradient_kernel(
         placed = camera * n + row
         visible = is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        red, green, blue, of_opacity = load_four(found + placed * gradient)
-        of_x, of_y, of_wide, of_skew = load_four(found + placed * gradient + 4)
+        red, green, blue, of_opacity = load_four(by_records + placed * gradient)
+        of_x, of_y, of_wide, of_skew = load_four(by_records + placed * gradient + 4)
         of_high = tl.load(others + placed * stride)
         _, _, conic_a, conic_b = load_four(records + placed * record)
         conic_c = tl.load(records + placed * record + 4)
@@ -603,7 +604,7 @@ def camera_of(
 
 
 def project(
-    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
+    parameters: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
     rules: Rules = GSPLAT, numbers: Numbers = NUMBERS, first: Tensor | None = None,
 ) -> Projected:  # fmt: skip
     """Project at least one Gaussian, and evaluate its colour.
@@ -612,22 +613,22 @@ def project(
         degree: highest of SH to evaluate.
         signed: whether colours are the raw SH values.
         with_geometry: fill in visible radii and centres.
-        rules, numbers: those of `given`, too.
+        rules, numbers: those of `parameters`, too.
         first: (n, 1, 3) first coefficients, if they are apart.
     """
-    count, n, like = len(cameras.poses), len(given.means), given.means
+    count, n, like = len(cameras.poses), len(parameters.means), parameters.means
     integers = like.new_empty(count, n, 2, dtype=torch.int32)
     described = n if with_geometry else 0
     projected = Projected(
         integers, like.new_empty(count, 0 if rules.family else n, 2), like.new_empty(count, n),
         like.new_empty(count, n, RECORD), integers.new_empty(count, described), like.new_empty(count, described, 2),
     )  # fmt: skip
-    _project(given, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
+    _project(parameters, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
     return projected
 
 
 def project_into(
-    stacked: Sequence[Tensor], start: int, given: Parameters, cameras: DeviceCameras, camera: int, signed: bool
+    stacked: Sequence[Tensor], start: int, parameters: Parameters, cameras: DeviceCameras, camera: int, signed: bool
 ) -> None:
     """Write the projection of one field, seen by one of some cameras, to the tensors of a stack of fields.
 
@@ -635,11 +636,11 @@ def project_into(
         stacked: radii (m, 2), centres (m, 2), depths (m,) and records (m, RECORD) of all fields.
         start: first row of this one.
         camera: number of its camera; its size is that of all.
-        given, cameras, signed: as `project` takes them; all coefficients are evaluated.
+        parameters, cameras, signed: as `project` takes them; all coefficients are evaluated.
     """
     projected = Projected(*stacked, *stacked[:2])
-    degree = math.isqrt(given.sh.shape[1]) - 1
-    _project(given, None, cameras, (camera, 1), degree, signed, projected, start, False, GSPLAT, NUMBERS)
+    degree = math.isqrt(parameters.sh.shape[1]) - 1
+    _project(parameters, None, cameras, (camera, 1), degree, signed, projected, start, False, GSPLAT, NUMBERS)
 
 
 def _coefficients(sh: Tensor, rules: Rules) -> int:
@@ -648,68 +649,72 @@ def _coefficients(sh: Tensor, rules: Rules) -> int:
 
 
 def _project(
-    given: Parameters, first: Tensor | None, cameras: DeviceCameras, chosen: tuple[int, int], degree: int, signed: bool,
-    into: Projected, start: int, with_geometry: bool, rules: Rules, numbers: Numbers,
+    parameters: Parameters, first: Tensor | None, cameras: DeviceCameras, chosen: tuple[int, int], degree: int,
+    signed: bool, into: Projected, start: int, with_geometry: bool, rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
-    n = len(given.means)
+    n = len(parameters.means)
     launch(
         _project_kernel, (blocks(n, BLOCK),),
-        *given, given.sh if first is None else first, *cameras[:3], *into,
+        *parameters, parameters.sh if first is None else first, *cameras[:3], *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
-        coefficients=_coefficients(given.sh, rules), with_geometry=with_geometry, record=RECORD, block=BLOCK, tile=TILE,
+        coefficients=_coefficients(parameters.sh, rules), with_geometry=with_geometry,
+        record=RECORD, block=BLOCK, tile=TILE,
         family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
         exact=rules.exact, snug=rules.snug, activated=rules.activated, alpha=rules.alpha,
     )  # fmt: skip
 
 
 def project_backward(
-    given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
-    found: Tensor, others: Tensor, rules: Rules = GSPLAT, numbers: Numbers = NUMBERS,
+    parameters: Parameters, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor, records: Tensor,
+    by_records: Tensor, others: Tensor, rules: Rules = GSPLAT, numbers: Numbers = NUMBERS,
 ) -> Parameters:  # fmt: skip
     """Return the gradients by parameters, summed over cameras.
 
     Args:
-        given, cameras, degree, signed, rules, numbers: arguments of `project`.
+        parameters, cameras, degree, signed, rules, numbers: arguments of `project`.
         radii, records: its results.
-        found, others: gradients (c, n, GRADIENT) and (c, n, 1 or more) as `blend_backward` returns them.
+        by_records, others: gradients (c, n, GRADIENT) and (c, n, 1 or more) as `blend_backward` returns them.
     """
-    by = Parameters(*(torch.empty_like(value) for value in given))
+    by = Parameters(*(torch.empty_like(value) for value in parameters))
     _project_backward(
-        given, None, cameras, degree, signed, radii, records, found, others, by, None, None, rules, numbers
-    )
+        parameters, None, cameras, degree, signed, radii, records, by_records, others, by, None, None,
+        rules, numbers,
+    )  # fmt: skip
     return by
 
 
 def project_family_backward(
-    given: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
-    records: Tensor, found: Tensor, others: Tensor, rules: Rules, numbers: Numbers, columns: int,
+    parameters: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
+    records: Tensor, by_records: Tensor, others: Tensor, rules: Rules, numbers: Numbers, columns: int,
 ) -> tuple[Parameters, Tensor | None, Tensor]:  # fmt: skip
     """Return the gradients by parameters, by the first coefficients, and by centres in units of half images.
 
     Args:
-        given, first, cameras, degree, signed, rules, numbers: arguments of `project`; one camera.
+        parameters, first, cameras, degree, signed, rules, numbers: arguments of `project`; one camera.
         radii, records: its results.
-        found, others: as `blend_backward` returns them.
+        by_records, others: as `blend_backward` returns them.
         columns: of the gradient by centres: 3, or 4 of which the last two are sums of absolute values.
     """
-    by = Parameters(*(torch.empty_like(value) for value in given))
+    by = Parameters(*(torch.empty_like(value) for value in parameters))
     by_first = None if first is None else torch.empty_like(first)
-    by_screen = given.means.new_empty(len(given.means), columns)
+    by_screen = parameters.means.new_empty(len(parameters.means), columns)
     _project_backward(
-        given, first, cameras, degree, signed, radii, records, found, others, by, by_first, by_screen, rules, numbers
-    )
+        parameters, first, cameras, degree, signed, radii, records, by_records, others, by, by_first, by_screen,
+        rules, numbers,
+    )  # fmt: skip
     return by, by_first, by_screen
 
 
 def _project_backward(
-    given: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
-    records: Tensor, found: Tensor, others: Tensor, by: Parameters, by_first: Tensor | None, by_screen: Tensor | None,
-    rules: Rules, numbers: Numbers,
+    parameters: Parameters, first: Tensor | None, cameras: DeviceCameras, degree: int, signed: bool, radii: Tensor,
+    records: Tensor, by_records: Tensor, others: Tensor, by: Parameters, by_first: Tensor | None,
+    by_screen: Tensor | None, rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
-    n, count, coefficients = len(given.means), len(cameras.poses), _coefficients(given.sh, rules)
+    n, count, coefficients = len(parameters.means), len(cameras.poses), _coefficients(parameters.sh, rules)
     launch(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
-        *given[:4], *cameras[:2], radii, records, found, others, *by, by.means if by_screen is None else by_screen,
+        *parameters[:4], *cameras[:2], radii, records, by_records, others,
+        *by, by.means if by_screen is None else by_screen,
         cameras.width, cameras.height, n, count, numbers.modifier, numbers.blur, numbers.near,
         record=RECORD, gradient=GRADIENT, stride=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
@@ -719,8 +724,8 @@ def _project_backward(
         return
     launch(
         color_gradient_kernel, (blocks(n, BLOCK),),
-        given.means, cameras.centres, given.sh, given.sh if first is None else first, radii, records, found,
-        by.means, by.sh, by.sh if by_first is None else by_first,
+        parameters.means, cameras.centres, parameters.sh, parameters.sh if first is None else first,
+        radii, records, by_records, by.means, by.sh, by.sh if by_first is None else by_first,
         n, count, (degree + 1) ** 2, int(signed),
         record=RECORD, color_in_record=COLOR_IN_RECORD, gradient=GRADIENT,
         coefficients=coefficients, padded=triton.next_power_of_2(coefficients), block=BLOCK, apart=rules.apart,

@@ -273,7 +273,7 @@ def _store_sh(
 @triton.jit(do_not_specialize=NOT_SPECIALIZED)
 def color_gradient_kernel(
     means: tl.tensor, centres: tl.tensor, sh: tl.tensor, first_sh: tl.tensor, radii: tl.tensor, records: tl.tensor,
-    found: tl.tensor, by_mean: tl.tensor, by_sh: tl.tensor, by_first: tl.tensor,
+    by_records: tl.tensor, by_mean: tl.tensor, by_sh: tl.tensor, by_first: tl.tensor,
     n: tl.tensor, cameras: int, active: int, signed: int,
     record: tl.constexpr, color_in_record: tl.constexpr, gradient: tl.constexpr,
     coefficients: tl.constexpr, padded: tl.constexpr, block: tl.constexpr, apart: tl.constexpr,
@@ -290,7 +290,7 @@ def color_gradient_kernel(
         placed = camera * n + row
         visible = is_visible(radii, placed)
         placed = tl.where(visible, placed, 0)  # so that memory of others is not read
-        of_red, of_green, of_blue, _ = load_four(found + placed * gradient)
+        of_red, of_green, of_blue, _ = load_four(by_records + placed * gradient)
         color_r, color_g, color_b, _ = load_four(records + placed * record + color_in_record)
         of_red = tl.where(visible & ((signed != 0) | (color_r > 0.0)), of_red, 0.0)
         of_green = tl.where(visible & ((signed != 0) | (color_g > 0.0)), of_green, 0.0)

@@ -101,10 +101,10 @@ def _finish_kernel(
             steps //= 2
         tl.store(offsets + number, low, number <= all_tiles)
     else:
-        place = (tl.program_id(0) - of_tiles) * block + tl.arange(0, block)
-        there = place < room
-        there = there & (tl.load(keys + place, there, 0).to(tl.int32) - least < all_tiles)
-        tl.store(flat + place, tl.load(gaussians + tl.load(places + place, there, 0), there), there)
+        position = (tl.program_id(0) - of_tiles) * block + tl.arange(0, block)
+        there = position < room
+        there = there & (tl.load(keys + position, there, 0).to(tl.int32) - least < all_tiles)
+        tl.store(flat + position, tl.load(gaussians + tl.load(places + position, there, 0), there), there)
 
 
 def sort_by_depth(

@@ -111,12 +111,12 @@ def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]
     pairs = _LateNumber(number)
     room = _rounded(_rooms[key] if key in _rooms else MARGIN * pairs.read())
     while True:
-        made = attempt(room)
+        result = attempt(room)
         wanted = MARGIN * pairs.read()
         _rooms[key] = max(wanted, (1 - FORGOTTEN) * _rooms.get(key, 0.0))
         if pairs.read() <= room:
-            return made
-        del made  # its memory is needed
+            return result
+        del result  # its memory is needed
         room = _rounded(wanted)
 
 

@@ -158,9 +158,9 @@ def meets(
     on_column = tl.minimum(tl.maximum(-b * near_x * inverse_of(c), y - height), y)
     on_row = tl.minimum(tl.maximum(-b * near_y * inverse_of(a), x - width), x)
     square = 0.5 * (a * near_x * near_x + c * on_column * on_column)
-    found = square * share + b * near_x * on_column <= limit
+    crosses = square * share + b * near_x * on_column <= limit
     square = 0.5 * (a * on_row * on_row + c * near_y * near_y)
-    return found | (square * share + b * on_row * near_y <= limit)
+    return crosses | (square * share + b * on_row * near_y <= limit)
 
 
 @triton.jit

@@ -82,8 +82,8 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
 
 def _raster_settings(manifest: Manifest) -> dict[str, Any]:
     """Return the run's rasterizer settings that differ from the defaults."""
-    given = manifest.settings.get(RASTER_SETTINGS, {})
-    return {name: value for name, value in given.items() if value != CONSTANTS.get(name)}
+    recorded = manifest.settings.get(RASTER_SETTINGS, {})
+    return {name: value for name, value in recorded.items() if value != CONSTANTS.get(name)}
 
 
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
@@ -95,9 +95,9 @@ def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tup
         except LapgsError as error:
             obstacle = str(error).partition("; ")[0]  # without advice: another one renders
     if not on_gpu:
-        place = "on the CPU" if device == "cpu" else "without a CUDA device"
+        where = "on the CPU" if device == "cpu" else "without a CUDA device"
         failed = "" if trained in OWN or not obstacle else f", because {obstacle}"
-        return _named("cpu", "cpu", settings), f"the fastest {place}{failed}"
+        return _named("cpu", "cpu", settings), f"the fastest {where}{failed}"
     reason = gsplat.missing()
     if not reason:
         return _named(gsplat.NAME, "cuda", settings), obstacle
@@ -132,7 +132,7 @@ def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, An
     label = f"--rasterizer {name}" if name in OWN else f"--rasterizer {name}: {kind.__module__}.{kind.__qualname__}"
     try:
         known, unsupported = _split(settings or {}, inspect.signature(kind).parameters)
-        made = kind(**known)
+        rasterizer = kind(**known)
     except Exception as error:
         if name in OWN:
             raise
@@ -140,14 +140,14 @@ def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, An
         raise UserInputError(
             f"{label} cannot be made without arguments: {typed_line(error)}; fix or uninstall its package"
         ) from error
-    if made.name != name:
-        raise UserInputError(f"{label} has the name {made.name}, expected that of its entry point, {name}")
+    if rasterizer.name != name:
+        raise UserInputError(f"{label} has the name {rasterizer.name}, expected that of its entry point, {name}")
     here = ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",)
-    usable = [each for each in made.devices if each in here and device in ("auto", each)]
+    usable = [supported for supported in rasterizer.devices if supported in here and device in ("auto", supported)]
     if not usable:
-        place = "this machine has no CUDA device" if device == "auto" else f"not on --device {device}"
-        raise UserInputError(f"{label} renders on {' or '.join(made.devices)}, {place}; choose another rasterizer")
-    return PlacedRasterizer(made, torch.device(usable[0]), unsupported)
+        why = "this machine has no CUDA device" if device == "auto" else f"not on --device {device}"
+        raise UserInputError(f"{label} renders on {' or '.join(rasterizer.devices)}, {why}; choose another rasterizer")
+    return PlacedRasterizer(rasterizer, torch.device(usable[0]), unsupported)
 
 
 def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any]) -> PlacedRasterizer:
@@ -160,12 +160,12 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
             raise UserInputError(
                 f"--rasterizer {name}: it has no stand-in for a CPU; leave the option out, or render on a CUDA device"
             )
-        place, module = "cpu", modules[name]
+        where, module = "cpu", modules[name]
     else:
-        place, module = "cuda", import_extension(name)
+        where, module = "cuda", import_extension(name)
     known, unsupported = _split(settings, constants_of(module))
-    extension = CudaExtension(name, place, settings=known, module=module)
-    return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(place), unsupported)
+    extension = CudaExtension(name, where, settings=known, module=module)
+    return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(where), unsupported)
 
 
 def _split(settings: Mapping[str, Any], known: Container[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -176,8 +176,8 @@ def _split(settings: Mapping[str, Any], known: Container[str]) -> tuple[dict[str
 
 def _log_choice(manifest: Manifest, placed: PlacedRasterizer, why: str) -> None:
     name = placed.rasterizer.name
-    place = torch.cuda.get_device_name() if placed.device.type == "cuda" else "the CPU"
-    line = f"rendering with {'the CPU rasterizer' if name == 'cpu' else f'{name} on {place}'}: {why}"
+    device_name = torch.cuda.get_device_name() if placed.device.type == "cuda" else "the CPU"
+    line = f"rendering with {'the CPU rasterizer' if name == 'cpu' else f'{name} on {device_name}'}: {why}"
     if name != manifest.rasterizer:
         line += f"; the run was trained with {manifest.rasterizer}, images may differ slightly"
     if placed.unsupported:

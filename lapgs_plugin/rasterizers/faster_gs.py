@@ -112,7 +112,7 @@ class FasterGsRasterizer(Rasterizer):
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
         """Render `field`; see `fields.rasterizer.Rasterizer`."""
-        differentiated = torch.is_grad_enabled() and any(each.requires_grad for each in field.parameters.values())
+        differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
         means2d = field.means.new_zeros(len(field), 2).requires_grad_(differentiated)
         image = self._image(field, camera, background, sh_degree, means2d if differentiated else None)
         with torch.no_grad():
@@ -235,7 +235,7 @@ def _with_companion(field: GaussianField, camera: Camera) -> GaussianField:
     added = companion(camera, field.means.detach())
     sh = torch.cat([added.sh, added.sh.new_zeros(1, field.sh.shape[1] - 1, 3)], 1)
     parts = {**added.parameters, "sh": sh}
-    return field.with_parameters({name: torch.cat([each, parts[name]]) for name, each in field.parameters.items()})
+    return field.with_parameters({name: torch.cat([values, parts[name]]) for name, values in field.parameters.items()})
 
 
 class _NotedNorms(torch.autograd.Function):

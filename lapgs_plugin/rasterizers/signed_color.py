@@ -155,7 +155,7 @@ def explain_fallback(module: str, checkout: Path) -> str:
     target = next(_sources(module, checkout), None)
     if target is None:
         return f"{slow}; `lapgs patch apply CHECKOUT` on the sources it was built from, then reinstall it"
-    state = {found.set: found.state for found in status(target)}.get(SIGNED_COLOR_SET)
+    state = {patches.set: patches.state for patches in status(target)}.get(SIGNED_COLOR_SET)
     if state is State.APPLIED:
         return (
             f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run "

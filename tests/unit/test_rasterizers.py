@@ -524,7 +524,7 @@ def test_what_a_backward_pass_needed_is_let_go_at_once(without_cuda: WithoutCuda
     gc.disable()
     try:
         result = GsplatRasterizer("cpu", absgrad=False)(case.field, case.camera, background=torch.zeros(3))
-        centres = weakref.ref(result.means2d.found)  # type: ignore[attr-defined]  # where gsplat leaves its gradients
+        centres = weakref.ref(result.means2d.of_gsplat)  # type: ignore[attr-defined]  # where gsplat leaves its gradients
         result.image.sum().backward()
         assert result.means2d.grad is not None
         del result

@@ -72,29 +72,29 @@ def _render(
         with_geometry: fill in visible radii and centres, which are empty otherwise.
     """
     background = background.to(field.means).contiguous()
-    given = Parameters.of(field)
+    parameters = Parameters.of(field)
     targets: GradientTargets = []
     if is_differentiated(field):
         box: list[Projected] = []
         options = cameras, background, degree, field.signed, with_geometry, absgrad, box, targets
-        image: Tensor = _Render.apply(*given, *options)  # type: ignore[no-untyped-call]  # torch's
+        image: Tensor = _Render.apply(*parameters, *options)  # type: ignore[no-untyped-call]  # torch's
         return image, box[0], targets
-    seen, _, (images, *_) = forward(given, cameras, background, degree, field.signed, with_geometry)
+    seen, _, (images, *_) = forward(parameters, cameras, background, degree, field.signed, with_geometry)
     return _channels_first(images), seen, targets
 
 
 def forward(
-    given: Parameters, cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, with_geometry: bool
+    parameters: Parameters, cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, with_geometry: bool
 ) -> tuple[Projected, tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
     """Return Gaussians as the cameras see them; their tiles, sorted; and what `blend_forward` makes of them.
 
     Args:
         background: (3,).
-        given, cameras, degree, signed, with_geometry: as `kernels.project` takes them.
+        parameters, cameras, degree, signed, with_geometry: as `kernels.project` takes them.
     """
     from lapgs_plugin.gpu_raster.kernels import project
 
-    seen = project(given, cameras, degree, signed, with_geometry)
+    seen = project(parameters, cameras, degree, signed, with_geometry)
     size = cameras.width, cameras.height
     return seen, *blend_in_tiles(seen, background, size, len(cameras.poses))
 
@@ -113,9 +113,9 @@ class _Render(torch.autograd.Function):
         cameras: DeviceCameras, background: Tensor, degree: int, signed: bool, with_geometry: bool, absgrad: bool,
         box: list[Projected], targets: GradientTargets,
     ) -> Tensor:  # fmt: skip
-        given = Parameters(means, quaternions, log_scales, logits, sh)
-        seen, tiles, blended = forward(given, cameras, background, degree, signed, with_geometry)
-        ctx.save_for_backward(*given, *cameras[:3], seen.radii, seen.records, *tiles, *blended)
+        parameters = Parameters(means, quaternions, log_scales, logits, sh)
+        seen, tiles, blended = forward(parameters, cameras, background, degree, signed, with_geometry)
+        ctx.save_for_backward(*parameters, *cameras[:3], seen.radii, seen.records, *tiles, *blended)
         ctx.size, ctx.degree, ctx.signed = (cameras.width, cameras.height), degree, signed
         ctx.absgrad, ctx.targets = absgrad, targets
         box.append(seen)
@@ -128,12 +128,12 @@ class _Render(torch.autograd.Function):
         from lapgs_plugin.gpu_raster.kernels import project_backward
 
         saved = ctx.saved_tensors
-        given, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.size)
+        parameters, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.size)
         radii, records, offsets, flat, images, counts, words = saved[8:]
         by_images = by_image.movedim(-3, -1).contiguous().view(images.shape)
-        found, others = blend_backward(records, offsets, flat, images, counts, words, by_images, ctx.absgrad)
-        by = project_backward(given, cameras, ctx.degree, ctx.signed, radii, records, found, others)
-        _write_gradients(ctx.targets, found[..., 4:6], others[..., 1:])
+        by_records, others = blend_backward(records, offsets, flat, images, counts, words, by_images, ctx.absgrad)
+        by = project_backward(parameters, cameras, ctx.degree, ctx.signed, radii, records, by_records, others)
+        _write_gradients(ctx.targets, by_records[..., 4:6], others[..., 1:])
         return *by, *[None] * 8
 
 

@@ -36,7 +36,7 @@ class DirectStack(FieldStack):
         images = torch.arange(len(fields), device=device)
         self._images = torch.repeat_interleave(images, torch.tensor([len(field) for field in fields], device=device))
         parts = [Parameters.of(field.detach()) for field in fields]
-        self._fields = [Parameters(*(part.to(device, copy=True) for part in each)) for each in parts]
+        self._fields = [Parameters(*(part.to(device, copy=True) for part in field)) for field in parts]
         if device.type == "cuda":
             torch.cuda.synchronize(device)  # once: from now on every stream may use it
 

@@ -150,8 +150,8 @@ def _colors(call: _Call, inputs: dict[str, Any]) -> tuple[Tensor, Tensor, dict[s
     colors = inputs["colors"]
     if inputs.get("sh_degree") is None:
         colors = colors.reshape(-1, 3)
-    given = inputs["means"], inputs["quats"], inputs["scales"], inputs["opacities"], colors
-    images, alphas = _Rasterize.apply(call, *given)  # type: ignore[no-untyped-call]  # torch's
+    parameters = inputs["means"], inputs["quats"], inputs["scales"], inputs["opacities"], colors
+    images, alphas = _Rasterize.apply(call, *parameters)  # type: ignore[no-untyped-call]  # torch's
     seen = call.seen
     assert seen is not None
     call.seen = None  # the backward pass has what it needs
@@ -187,14 +187,14 @@ class _Rasterize(torch.autograd.Function):
         from lapgs_plugin.gpu_raster.kernels import project
 
         parts = means, quats, scales, opacities, colors
-        given = Parameters(*(aligned(part.detach()) for part in parts))
+        parameters = Parameters(*(aligned(part.detach()) for part in parts))
         cameras, sizes = call.cameras, call.sizes
-        seen = project(given, cameras, sizes.degree, sizes.signed, rules=RULES, numbers=sizes.numbers)
+        seen = project(parameters, cameras, sizes.degree, sizes.signed, rules=RULES, numbers=sizes.numbers)
         size, count = (cameras.width, cameras.height), len(cameras.poses)
         alphas = means.new_empty(count, size[1], size[0])
         tiles, (images, *others) = blend_in_tiles(seen, call.background, size, count, alphas=alphas)
         ctx.call, call.seen = call, seen
-        ctx.save_for_backward(*given, seen.radii, seen.records, *tiles, images, alphas, *others)
+        ctx.save_for_backward(*parameters, seen.radii, seen.records, *tiles, images, alphas, *others)
         ctx.set_materialize_grads(False)
         # Copies, which scripts may change in place: simple_trainer blackens masked pixels.
         return images.clone(), alphas[..., None].clone()
@@ -207,20 +207,21 @@ class _Rasterize(torch.autograd.Function):
 
         call: _Call = ctx.call
         *parts, radii, records, offsets, flat, images, alphas, counts, words = ctx.saved_tensors
-        given, sizes = Parameters(*parts), call.sizes
+        parameters, sizes = Parameters(*parts), call.sizes
         by_images = torch.zeros_like(images) if by_images is None else by_images.contiguous()
         beside: dict[str, Any] = {}
         if by_alphas is not None:  # most losses do not use opacities
             beside = {"rules": WITH_ALPHAS, "inverse_depths": (alphas, by_alphas.contiguous())}
-        found, others = blend_backward(
+        by_records, others = blend_backward(
             records, offsets, flat, images, counts, words, by_images, sizes.absgrad, **beside
         )
         by = project_backward(
-            given, call.cameras, sizes.degree, sizes.signed, radii, records, found, others, RULES, sizes.numbers
-        )
+            parameters, call.cameras, sizes.degree, sizes.signed, radii, records, by_records, others, RULES,
+            sizes.numbers,
+        )  # fmt: skip
         centres: Any = None if call.centres is None else call.centres()
         if centres is not None:
-            centres.grad = found[..., 4:6].contiguous()
+            centres.grad = by_records[..., 4:6].contiguous()
             if sizes.absgrad:
                 centres.absgrad = others[..., 1:3].contiguous()
         return None, *by

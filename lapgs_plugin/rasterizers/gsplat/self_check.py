@@ -43,21 +43,21 @@ def direct_works(device: torch.device) -> float:
         for with_geometry in (True, False):
             leaves = [value.to(device, copy=True).requires_grad_() for value in values]
             on_device = CameraCache().get(cameras, leaves[0])
-            given = _field(leaves, signed), on_device, background.to(device), degree
+            arguments = _field(leaves, signed), on_device, background.to(device), degree
             if with_geometry:
-                result = direct.render(*given, absgrad=True, own_radii=True)
+                result = direct.render(*arguments, absgrad=True, own_radii=True)
                 image = result.image
             else:
-                image = direct.render_images(*given)
+                image = direct.render_images(*arguments)
             (image * weights.to(device)).sum().backward()  # type: ignore[no-untyped-call]  # torch's
-            found = [image.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+            results = [image.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
             if with_geometry:
                 assert result.absgrad2d is not None
                 assert result.means2d.grad is not None
-                found += [result.means2d.grad, result.absgrad2d]
+                results += [result.means2d.grad, result.absgrad2d]
             differences += [
                 (one.cpu().view_as(exactly) - exactly).abs() / exactly.abs().max()
-                for one, exactly in zip(found, expected, strict=False)
+                for one, exactly in zip(results, expected, strict=False)
             ]
     return largest(differences)
 

@@ -82,7 +82,7 @@ class GsplatStack(FieldStack):
             rows = self._rows(i)
             if rows.start == rows.stop:
                 continue  # gsplat divides by their number
-            *found, dimmed = fully_fused_projection(
+            *projected, dimmed = fully_fused_projection(
                 self._means[rows],
                 None,
                 self._quaternions[rows],
@@ -96,7 +96,7 @@ class GsplatStack(FieldStack):
                 calc_compensations=self._antialiased,
                 opacities=self._opacities[rows],
             )  # (1, n_i, ...) each
-            fields.append([values[0] for values in (*found, *([dimmed] if self._antialiased else []))])
+            fields.append([values[0] for values in (*projected, *([dimmed] if self._antialiased else []))])
         joined = [torch.cat(parts) if len(parts) > 1 else parts[0] for parts in zip(*fields, strict=True)]
         opacities = self._opacities[: self._starts[len(cameras)]]
         return [*joined[:4], opacities * joined[4] if self._antialiased else opacities]

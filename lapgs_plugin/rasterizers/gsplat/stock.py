@@ -149,8 +149,8 @@ def raw_sh_values(degree: int, means: Tensor, sh: Tensor, viewmats: Tensor, posi
     if takes_viewmats(spherical_harmonics):
         values: Tensor = spherical_harmonics(degree, means, viewmats, sh)
         return values
-    each = [spherical_harmonics(degree, means - position, sh) for position in positions]  # (n, 3)
-    return each[0][None] if len(each) == 1 else torch.stack(each)
+    colors = [spherical_harmonics(degree, means - position, sh) for position in positions]  # (n, 3)
+    return colors[0][None] if len(colors) == 1 else torch.stack(colors)
 
 
 def _hand_over_gradients(info: dict[str, Any], means2d: Tensor, absgrad2d: Tensor | None) -> None:
@@ -159,7 +159,7 @@ def _hand_over_gradients(info: dict[str, Any], means2d: Tensor, absgrad2d: Tenso
     ids: Tensor | None = info["gaussian_ids"] if theirs.ndim == 2 else None  # (v,)
     # The backward pass stores absolute gradients on gsplat's tensor, which has to live as long as ours.
     ours: Any = means2d
-    ours.found = theirs
+    ours.of_gsplat = theirs
     # Weak references: a hook that held one of them would be part of a cycle with everything that the backward pass
     # needs, and a GPU's memory would fill up before Python collects cycles.
     weak_theirs, weak_ours = weakref.ref(theirs), weakref.ref(means2d)
