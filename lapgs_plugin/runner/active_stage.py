@@ -182,11 +182,12 @@ class ActiveStage(RunningStage):
         self._context.request.watcher.stage_started(self.stage)
 
     def require_trained(self, done: int, total: int, *, ended: bool = True) -> None:
-        """Check that the script's call, which has returned, trained this stage, the last one that it trains.
+        """Check that this stage was trained, after the script's call for it has returned.
 
         Args:
-            done, total: iterations of the call that were seen, and those that it was asked for.
-            ended: whether it got as far as to the last stage.
+            done: iterations of the call that were seen.
+            total: iterations that the call was asked for.
+            ended: whether the call got as far as to its last stage; one call may train several.
 
         Raises:
             LapgsError: no iteration of the stage was seen, or the call returned before the last stage.

@@ -279,20 +279,20 @@ class DryRun:
 
     def _require_settable(self, gaussians: Any) -> None:
         """Refuse a model whose parameters are computed, which cannot start from a finished field."""
-        place = self._adapter.profile.source.model[1]
+        location = self._adapter.profile.source.model[1]
         names = self._adapter.archived_parameters()
-        made = {name: getattr(type(gaussians), name, None) for name in names}
-        computed = [name for name, by in made.items() if isinstance(by, property) and by.fset is None]
+        descriptors = {name: getattr(type(gaussians), name, None) for name in names}
+        computed = [name for name, by in descriptors.items() if isinstance(by, property) and by.fset is None]
         if computed := computed or [name for name in names if getattr(gaussians, name).grad_fn is not None]:
             raise UserInputError(
-                f"{place}: the model computes {', '.join(computed)} of other values, expected parameters, which a "
+                f"{location}: the model computes {', '.join(computed)} of other values, expected parameters, which a "
                 f"residual's are set to; {NESTED_WORKS}"
             )
 
     def _require_three_axes(self, gaussians: Any) -> None:
-        place, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]
+        location, axes = self._adapter.profile.source.model[1], gaussians._scaling.shape[1]
         if axes != 3:
-            raise UserInputError(f"{place}: residuals need three scale axes, found {axes}; {NESTED_WORKS}")
+            raise UserInputError(f"{location}: residuals need three scale axes, found {axes}; {NESTED_WORKS}")
 
     @property
     def _training_place(self) -> str:
@@ -319,12 +319,12 @@ class DryRun:
             self._require_signed(expected[0])
             if rest.shape[1] < NATIVE_COEFFICIENTS:
                 return ColorPath.PRECOMPUTED
-            found = self._colored(view, gaussians, ColorPath.NATIVE)
+            images = self._colored(view, gaussians, ColorPath.NATIVE)
         finally:
             gaussians._features_dc, gaussians._features_rest = kept
         same = all(
             bool(((a - b).abs() <= PROBE_TOLERANCE * (1 + b.abs().max())).all())
-            for a, b in zip(found, expected, strict=True)
+            for a, b in zip(images, expected, strict=True)
         )
         return ColorPath.NATIVE if same else ColorPath.PRECOMPUTED
 
@@ -354,20 +354,21 @@ class DryRun:
         except (LapgsError, torch.cuda.OutOfMemoryError):
             raise
         except Exception as error:
-            place = place_of(error, self._adapter)
+            location = place_of(error, self._adapter)
             raise UserInputError(
-                f"dry run: {what} failed at {place}: {typed_line(error)}; expected {expected}; {works}"
+                f"dry run: {what} failed at {location}: {typed_line(error)}; expected {expected}; {works}"
             ) from error
 
 
 def place_of(error: Exception, adapter: BackboneAdapter) -> str:
     """Return file and line, of the checkout or of another package's adapter of it, in which an error was raised."""
-    root, modules = adapter.root, [each.__module__ for each in type(adapter).__mro__]
+    root, modules = adapter.root, [ancestor.__module__ for ancestor in type(adapter).__mro__]
     brought = {getattr(sys.modules[name], "__file__", None) for name in modules if not name.startswith("lapgs_plugin.")}
     frames = traceback.extract_tb(error.__traceback__)
-    own = [each for each in frames if Path(each.filename).is_relative_to(root) or each.filename in brought] or frames
-    path = Path(own[-1].filename)
-    return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{own[-1].lineno}"
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(root) or frame.filename in brought]
+    innermost = (own or frames)[-1]
+    path = Path(innermost.filename)
+    return f"{path.relative_to(root) if path.is_relative_to(root) else path.name}:{innermost.lineno}"
 
 
 def _rows(gaussians: Any) -> dict[str, int]:

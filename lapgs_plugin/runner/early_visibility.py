@@ -22,14 +22,22 @@ from lapgs_plugin.checkouts.syntax import stored_names
 
 logger = logging.getLogger(__name__)
 
-VISIBLE, MASK, INDEX = "_lapgs_visible", "_lapgs_mask", "_lapgs_index"
-"""Names of the replacements of `(radii > 0).nonzero()` and `radii > 0`, and of a mask in `x[mask]`."""
+VISIBLE = "_lapgs_visible"
+"""Name of the function that takes the place of `(radii > 0).nonzero()`."""
+MASK = "_lapgs_mask"
+"""Name of the function that takes the place of `radii > 0`."""
+INDEX = "_lapgs_index"
+"""Name of the function that is called with the mask of `x[mask]`."""
 COUNTED = "num_rendered"
 """Attribute in which the family's rasterizers keep the number of pairs for their backward pass."""
 KEY = "visibility_filter"
 """Name of the mask or the indices in the results of the family's renderers."""
-PROJECTED, RADII, INDICES = "_lapgs_projected", "_lapgs_radii", "_lapgs_indices"
-"""Attributes of radii that are there, which holds their version; of a mask: its radii, and its indices."""
+PROJECTED = "_lapgs_projected"
+"""Attribute of radii that are there: their version."""
+RADII = "_lapgs_radii"
+"""Attribute of a mask: the radii that it was made of."""
+INDICES = "_lapgs_indices"
+"""Attribute of a mask: its indices."""
 
 COMPARED = 20
 """Renders at first of which the indices are compared with those that are waited for."""
@@ -88,7 +96,7 @@ class EarlyVisibility:
         return mask
 
     def index(self, mask: Any) -> Any:
-        """Return a mask, or its indices (k,) if they are found early."""
+        """Return the indices (k,) of a mask that `mask` noted, or the mask if it or its radii have changed since."""
         radii = getattr(mask, RADII, None)
         if radii is None or mask._version > 0 or not _is_noted(radii):  # any of them may be changed in place
             return mask

@@ -90,7 +90,7 @@ def decide(module: str, trials: Sequence[Trial]) -> Decision:
 
 
 def _mean(times: Sequence[Times]) -> Times:
-    return Times(*(sum(getattr(each, name) for each in times) / len(times) for name in ("forward", "backward")))
+    return Times(*(sum(getattr(one, name) for one in times) / len(times) for name in ("forward", "backward")))
 
 
 def decided_without_trials(modules: CompiledModules, kept: Manifest | None, *, tries: bool) -> Decision | None:
@@ -132,7 +132,7 @@ def _kept(modules: CompiledModules, manifest: Manifest) -> Decision | None:
 
 def recorded_choice(manifest: Manifest) -> Decision | None:
     """Return the choice that a run was trained with; None for runs of earlier versions and of a CPU."""
-    found: Any = manifest.settings.get(CHOICE)
-    if not isinstance(found, dict) or found.get("taken") not in (OWN, OURS):
+    recorded: Any = manifest.settings.get(CHOICE)
+    if not isinstance(recorded, dict) or recorded.get("taken") not in (OWN, OURS):
         return None
-    return Decision(found["taken"], str(found.get("why", "")))
+    return Decision(recorded["taken"], str(recorded.get("why", "")))

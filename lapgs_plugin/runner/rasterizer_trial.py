@@ -104,7 +104,7 @@ def trials_of(calls: Iterable[RasterizerCall], device: torch.device) -> Iterator
 
 def tried(call: RasterizerCall, device: torch.device) -> Trial:
     """Return the measurements of a call."""
-    own, ours = (rendered(each, call, device) for each in (call.own, call.ours))
+    own, ours = (rendered(function, call, device) for function in (call.own, call.ours))
     height, width = own.image.shape[1:]
     return Trial(call.view, (width, height), call.count, own.times, ours.times, difference(own, ours))
 
@@ -123,11 +123,11 @@ def rendered(rasterizer: Callable[..., Any], call: RasterizerCall, device: torch
         if weights is None:
             weights = _weights(image)
         middle = clock.now()
-        found = torch.autograd.grad(image, tuple(wanted.values()), weights, allow_unused=True)
+        grads = torch.autograd.grad(image, tuple(wanted.values()), weights, allow_unused=True)
         times.append((start, middle, clock.now()))
     forward = statistics.median(clock.milliseconds(start, middle) for start, middle, _ in times[WARM_UP:])
     backward = statistics.median(clock.milliseconds(middle, end) for _, middle, end in times[WARM_UP:])
-    gradients = {name: each for name, each in zip(wanted, found, strict=True) if each is not None}
+    gradients = {name: gradient for name, gradient in zip(wanted, grads, strict=True) if gradient is not None}
     return Rendered(image.detach(), _radii(outputs, call.count), gradients, Times(forward, backward))
 
 
@@ -186,7 +186,7 @@ def _of_images(own: Tensor, ours: Tensor) -> str:
     if own.shape != ours.shape:
         return f"its image is {tuple(ours.shape)}, with its own {tuple(own.shape)}"
     error = (own - ours).abs().amax(0).nan_to_num(torch.inf)  # (h, w)
-    share, large = (float((error > each).float().mean()) for each in (PIXEL_TOLERANCE, LARGE_TOLERANCE))
+    share, large = (float((error > tolerance).float().mean()) for tolerance in (PIXEL_TOLERANCE, LARGE_TOLERANCE))
     if share <= PIXEL_SHARE and large <= LARGE_SHARE:
         return ""
     y, x = divmod(int(error.argmax()), error.shape[1])
@@ -210,15 +210,15 @@ def _of_radii(own: Tensor | None, ours: Tensor | None) -> str:
 
 
 def _of_gradients(name: str, own: Rendered, ours: Rendered) -> str:
-    expected, found = own.gradients[name], ours.gradients.get(name)
-    if found is None or found.shape != expected.shape:
+    expected, gradient = own.gradients[name], ours.gradients.get(name)
+    if gradient is None or gradient.shape != expected.shape:
         return f"it has no gradient by {name} of the shape {tuple(expected.shape)}"
-    error, norm = float((found - expected).norm()), float(expected.norm())
+    error, norm = float((gradient - expected).norm()), float(expected.norm())
     if error <= GRADIENT_TOLERANCE * norm:
         return ""
-    place = int((found - expected).abs().nan_to_num(torch.inf).argmax())
-    row = place // max(1, expected[0].numel())
-    values = (f"{float(each.flatten()[place]):.4g}" for each in (found, expected))
+    worst = int((gradient - expected).abs().nan_to_num(torch.inf).argmax())
+    row = worst // max(1, expected[0].numel())
+    values = (f"{float(tensor.flatten()[worst]):.4g}" for tensor in (gradient, expected))
     share = f"{100 * error / norm:.2g} %" if norm else "all"
     return f"the gradient by {name} by {share} of its norm, most of Gaussian {row}: {' instead of '.join(values)}"
 

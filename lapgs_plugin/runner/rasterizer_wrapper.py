@@ -35,15 +35,15 @@ class _RendererCall:
     Attributes:
         way: the renderer, and whether its arguments ask it to evaluate SH itself; None outside of renderers.
         key: key of the view; None for other cameras.
-        place: file and line of the call.
-        given: values of each Gaussian (n, k) among its arguments, such as colours to render instead.
+        location: file and line of the call.
+        values: numbers of each Gaussian (n, k) among its arguments, such as colours to render instead.
         done: not empty once the model's colours were rasterized.
     """
 
     way: tuple[Callable[..., Any], bool] | None = None
     key: str | None = None
-    place: str = "the checkout"
-    given: tuple[Tensor, ...] = ()
+    location: str = "the checkout"
+    values: tuple[Tensor, ...] = ()
     done: list[bool] = field(default_factory=list)
 
 
@@ -79,21 +79,21 @@ class RasterizerWrapper:
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
-        made = original if self.visibility is None else self.visibility.in_renderer(original)
+        renderer = original if self.visibility is None else self.visibility.in_renderer(original)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
-            outer, given = self.running, (*args, *kwargs.values())
-            key = next((key for v in given if (key := view_key(v)) is not None), outer.key)
-            values = tuple(v for v in given if isinstance(v, Tensor) and v.ndim == 2)
-            way = original, any(getattr(v, "convert_SHs_python", False) is True for v in given)
-            place = outer.place
+            outer, arguments = self.running, (*args, *kwargs.values())
+            key = next((key for v in arguments if (key := view_key(v)) is not None), outer.key)
+            values = tuple(v for v in arguments if isinstance(v, Tensor) and v.ndim == 2)
+            way = original, any(getattr(v, "convert_SHs_python", False) is True for v in arguments)
+            location = outer.location
             if outer.way is None:
                 caller = sys._getframe(1)
-                place = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
-            self.running = _RendererCall(way, key, place, (*outer.given, *values))
+                location = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
+            self.running = _RendererCall(way, key, location, (*outer.values, *values))
             try:
-                return made(*args, **kwargs)
+                return renderer(*args, **kwargs)
             finally:
                 self.running = outer
 
@@ -101,18 +101,18 @@ class RasterizerWrapper:
 
     def replacements(self, profile: Profile, consumer: str) -> list[Replacement]:
         """Return replacements where a checkout holds its renderers, and looks rasterizers and their settings up."""
-        found = [(place, self.renderer) for function in profile.renderers for place in profile.holders(function)]
+        makers = [(holder, self.renderer) for function in profile.renderers for holder in profile.holders(function)]
         for rasterizer in profile.rasterizers:
             # The dry run compares that of the training loop alone.
             compared = rasterizer.module is profile.rasterizers[0].module
             ours = self._ours.get(rasterizer.use.module) if compared else None
             for name in rasterizer.settings:
-                found += [(place, self.settings) for place in profile.places(rasterizer, name)]
+                makers += [(holder, self.settings) for holder in profile.places(rasterizer, name)]
             for name in rasterizer.entries:
                 kind = self.wrap_class if inspect.isclass(vars(rasterizer.module)[name]) else self.wrap_function
                 make = partial(kind, ours=getattr(ours, name, None))
-                found += [(place, make) for place in profile.places(rasterizer, name)]
-        return [Replacement(*place, make, consumer) for place, make in found]
+                makers += [(holder, make) for holder in profile.places(rasterizer, name)]
+        return [Replacement(*holder, make, consumer) for holder, make in makers]
 
     @contextmanager
     def taking_ours(self) -> Iterator[None]:
@@ -142,10 +142,10 @@ class RasterizerWrapper:
         """Return the replacement of the constructor of a rasterizer, and of ours in its place."""
 
         def make_rasterizer(*args: Any, **kwargs: Any) -> Any:
-            made = (ours if ours is not None and self.takes_ours else original)(*args, **kwargs)
+            rasterizer = (ours if ours is not None and self.takes_ours else original)(*args, **kwargs)
             if self._stages.rendering is None:
-                return made
-            return WrappedRasterizer(made, self._call_now(next(iter((*args, *kwargs.values())), None)))
+                return rasterizer
+            return WrappedRasterizer(rasterizer, self._call_now(next(iter((*args, *kwargs.values())), None)))
 
         return make_rasterizer
 
@@ -180,8 +180,8 @@ class RasterizerWrapper:
                 return outputs
 
             if not _has_model_colors(inputs, running, self._ways_of_sh):
-                return rendering.render_other(marked, inputs, settings, running.place)
-            return rendering.render(marked, inputs, settings, running.key, running.place)
+                return rendering.render_other(marked, inputs, settings, running.location)
+            return rendering.render(marked, inputs, settings, running.key, running.location)
 
         return call
 
@@ -209,7 +209,7 @@ def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, ways_of
             ways_of_sh.add(running.way)
         elif running.done or running.way in ways_of_sh:
             return False
-    if any(color is each for color in colors for each in running.given):
+    if any(color is argument for color in colors for argument in running.values):
         return False
     running.done.append(True)
     return True

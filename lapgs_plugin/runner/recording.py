@@ -108,6 +108,8 @@ class BareRunRecorder(TimedLoop):
         return training
 
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the replacement of the scene's class, which keeps the scene and times the steps of its model."""
+
         def make_scene(*args: Any, **kwargs: Any) -> Any:
             self._scene = original(*args, **kwargs)
             self.gaussians, profile = self._scene.gaussians, self._adapter.profile

@@ -74,10 +74,12 @@ class StageReplacements:
         ]
 
     def _in_residual(self) -> bool:
+        """Return whether the running stage trains a residual."""
         stage = self._stages.running
         return stage is not None and stage.stage.signed
 
     def _in_model(self, profile: Profile) -> list[Replacement]:
+        """Return replacements of the model's methods that set up training, control density or gather its statistics."""
         control = dict.fromkeys(profile.density_control, self._make_density_control)
         if not self._context.request.settings.prune_by_size:
             methods = {name: inspect.signature(getattr(profile.model, name)) for name in control}
@@ -108,12 +110,14 @@ class StageReplacements:
         return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in scores]
 
     def _in_losses(self, profile: Profile) -> list[Replacement]:
+        """Return replacements of the checkout's SSIM by ours, if the settings ask for it."""
         if not self._context.request.settings.fused_ssim:
             return []
         holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
         return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
         visibility = self._context.wrapper.visibility
         early = original if visibility is None else visibility.in_loop(reading_late(original))
 
@@ -124,6 +128,8 @@ class StageReplacements:
         return training
 
     def _make_scene(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the replacement of the scene's class, which returns the running stage's scene."""
+
         def make_scene(*args: Any, **kwargs: Any) -> Any:
             stage = self._stages.running
             assert stage is not None, "training() makes its scene inside a stage"
@@ -135,6 +141,8 @@ class StageReplacements:
         return make_scene
 
     def _make_training_setup(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a model's `training_setup` that tells the running stage once its optimizers are made."""
+
         @wraps(original)
         def training_setup(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(gaussians, *args, **kwargs)
@@ -152,7 +160,7 @@ class StageReplacements:
         return training_setup
 
     def _make_density_control(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Announce that density control is done after the outermost of its methods, which call one another."""
+        """Return a method of density control that tells the stage once the outermost of such calls is done."""
 
         @wraps(original)
         def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
@@ -168,6 +176,7 @@ class StageReplacements:
         return control
 
     def _make_opacity_reset(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the model's opacity reset, which does nothing in residuals unless the settings ask for it."""
         control = self._make_density_control(original)
 
         @wraps(original)

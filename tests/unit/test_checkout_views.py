@@ -162,7 +162,7 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
         else:
             image.sum().backward()
     assert render(view).unique().tolist() == [1.375], "the model's own colours are composed"
-    assert wrapper.running.given == ()
+    assert wrapper.running.values == ()
 
 
 @pytest.mark.parametrize("signed", [True, False])

@@ -61,12 +61,14 @@ def run_bare(script: Script, described: SplatScript, device: str, ours: bool = F
         device: as of `SplatRequest`.
         ours: let our kernels render on a GPU.
     """
-    made: list[Replacement] = []
+    replacements: list[Replacement] = []
     if device == "cpu" or ours:
         rasterize = _rasterizer(device, vars(script.module)[RASTERIZATION], ours=ours).render
-        made.append(Replacement(script.module, RASTERIZATION, lambda _: rasterize, f"{described.trainer}.train()"))
-        made += _single_process(script)
-    with Attachment(made):
+        replacements.append(
+            Replacement(script.module, RASTERIZATION, lambda _: rasterize, f"{described.trainer}.train()")
+        )
+        replacements += _single_process(script)
+    with Attachment(replacements):
         script.run_main()
 
 
@@ -107,16 +109,18 @@ class SplatDriver:
     def _replacements(self) -> list[Replacement]:
         of_class, of_script = vars(self._class), vars(self._module)
         trainer = f"{self._class.__name__}.train()"
-        made = [
+        replacements = [
             Replacement(self._class, "__init__", self._making, "the script's main block"),
             Replacement(self._class, "train", self._training, "the script's main block", ("self",)),
             Replacement(self._module, RASTERIZATION, lambda _: self._rasterize, trainer),
             Replacement(data, "DataLoader", self._loading, trainer),
         ]
-        made += [Replacement(self._class, n, self._measuring, trainer) for n in MEASUREMENTS if n in of_class]
+        replacements += [Replacement(self._class, n, self._measuring, trainer) for n in MEASUREMENTS if n in of_class]
         if isinstance(of_script.get("Parser"), type):
-            made.append(Replacement(self._module, "Parser", self._parsing, f"{self._class.__name__}.__init__()"))
-        return made + _single_process(self._request.script)
+            replacements.append(
+                Replacement(self._module, "Parser", self._parsing, f"{self._class.__name__}.__init__()")
+            )
+        return replacements + _single_process(self._request.script)
 
     def _making(self, original: Callable[..., None]) -> Callable[..., None]:
         self._init = original
@@ -300,7 +304,7 @@ def _beside_splats(trainer: Any) -> dict[str, torch.nn.Module]:
     """Return a trainer's modules without splats, such as corrections of poses and exposure, by attribute."""
     splats = set(map(id, trainer.splats.values()))
     modules = {name: value for name, value in vars(trainer).items() if isinstance(value, torch.nn.Module)}
-    return {name: each for name, each in modules.items() if not splats & set(map(id, each.parameters()))}
+    return {name: module for name, module in modules.items() if not splats & set(map(id, module.parameters()))}
 
 
 def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def prepare(request: SplatRequest, own: Rasterizer, trainer: Any, began: int) ->
         LapgsError: the script, its options, the scene, the run folder and the hierarchy do not go together.
     """
     name = type(trainer).__name__
-    if missing := [each for each in NEEDED if not hasattr(trainer, each)]:
+    if missing := [attribute for attribute in NEEDED if not hasattr(trainer, attribute)]:
         raise UserInputError(f"{name} of {request.script.path} has no {', '.join(missing)}; {OTHERWISE}")
     settings, config = request.settings, trainer.cfg
     refuse_settings(request)
@@ -211,11 +211,11 @@ def refuse_settings(request: SplatRequest) -> None:
     """
     settings, kind = request.settings, "scripts around gsplat's rasterization()"
     idle = {"supervision": RECONSTRUCTED, "prune": 0.0, "prune_by_size": True, "fused_ssim": True, "run_ahead": True}
-    declared = {each.name: each for each in fields(settings)}
+    declared = {setting.name: setting for setting in fields(settings)}
     for name, value in idle.items():
-        if (given := getattr(settings, name)) != value:
+        if (chosen := getattr(settings, name)) != value:
             option = option_name(declared[name])
-            raise UserInputError(f"{option} {given} has no effect with {kind}; leave it out, or use `lapgs train`")
+            raise UserInputError(f"{option} {chosen} has no effect with {kind}; leave it out, or use `lapgs train`")
     if settings.has_residuals and settings.inherit_mode == "full":
         raise UserInputError(f"--inherit full: of {kind} only geometry and xyz are inherited; choose one of them")
     if settings.masks not in ("auto", "none"):
@@ -223,7 +223,7 @@ def refuse_settings(request: SplatRequest) -> None:
     if request.measuring.breakdown:
         raise UserInputError(f"--breakdown: the parts of an iteration are not measured in {kind}; leave it out")
     if hooks := chosen_entries("--hooks", HOOKS, settings.hooks):
-        names = ", ".join(each.name for each in hooks)
+        names = ", ".join(hook.name for hook in hooks)
         raise UserInputError(f"--hooks: {names} cannot take part in {kind}; add --hooks none, or use `lapgs train`")
 
 

@@ -6,7 +6,7 @@ import copy
 from typing import Any
 
 from lapgs_plugin.checkouts.training_call import StageWindow
-from lapgs_plugin.hierarchy.settings import HierarchySettings
+from lapgs_plugin.hierarchy.settings import FREE_VIEWS, HierarchySettings
 
 THRESHOLD = "grow_grad2d"
 """Threshold of gsplat's DefaultStrategy on screen-space gradients."""
@@ -15,8 +15,6 @@ NEVER = 10**9
 FREE_SHARE = 0.02
 """Share of a residual's densification without a weight of mean opacity: it starts without colour, so that nothing holds
 its opacities against the weight."""
-FREE_VIEWS = 80
-"""Training views from which on that weight is smaller, in proportion to 1 / views."""
 
 
 def stage_config(config: Any, window: StageWindow, result_dir: str, settings: HierarchySettings) -> Any:

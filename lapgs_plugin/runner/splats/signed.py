@@ -50,8 +50,8 @@ class Rasterizer:
         if takes_viewmats(self.spherical_harmonics):
             return self.spherical_harmonics(degree, means, viewmats, coefficients)
         centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]  # (c, 3)
-        each = [self.spherical_harmonics(degree, means - centre, coefficients) for centre in centres]
-        return torch.stack(each)
+        colors = [self.spherical_harmonics(degree, means - centre, coefficients) for centre in centres]
+        return torch.stack(colors)
 
 
 @dataclass(frozen=True)

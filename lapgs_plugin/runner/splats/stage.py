@@ -154,8 +154,8 @@ class SplatStage:
         width, height = level_size(size, level)
         own = {**inputs, "Ks": level_intrinsics(inputs["Ks"], size, level), "width": width, "height": height}
         images, alphas, info = compose(self._run.rasterizer, own, self._coarser.predict)
-        full = (to_full_size(each.permute(0, 3, 1, 2), size, level, self._pyramid) for each in (images, alphas))
-        image, alpha = (each.permute(0, 2, 3, 1) for each in full)
+        full = (to_full_size(batch.permute(0, 3, 1, 2), size, level, self._pyramid) for batch in (images, alphas))
+        image, alpha = (batch.permute(0, 2, 3, 1) for batch in full)
         return image, alpha, info
 
     @torch.no_grad()
@@ -284,7 +284,8 @@ class SplatStage:
         if not self._joint or self._coarser is None:
             return None
         return {
-            each.level: field_from_splats(each.splats, each.signed).detach().to("cpu") for each in self._coarser.fields
+            coarse.level: field_from_splats(coarse.splats, coarse.signed).detach().to("cpu")
+            for coarse in self._coarser.fields
         }
 
     @torch.no_grad()
