@@ -64,11 +64,12 @@ def all_adapters() -> tuple[type[BackboneAdapter], ...]:
 def recognise(folder: Path) -> type[BackboneAdapter] | None:
     """Return the adapter of the checkout whose root is `folder`, None if it has no training script of 3DGS.
 
-    A fork has the files of the code that it was forked from. So of several backbones that recognise a folder, one loses
-    against those that ask for all of its files and more, and against those that say that they are forks of it.
+    A checkout that no backbone recognises has the generic adapter. A fork keeps the files of the code that it was
+    forked from, so both may recognise it, and the fork's adapter is returned. A backbone is a fork of another if it
+    says so, or if it asks for all of the other's files and more.
 
     Raises:
-        UserInputError: several are left, or an installed package's cannot be loaded.
+        UserInputError: several recognise it, none a fork of the others, or an installed package's cannot be loaded.
     """
     recognising = [adapter for adapter in all_adapters() if adapter.recognises(folder)]
     if not recognising and readable_source(folder) is not None:

@@ -129,6 +129,7 @@ def _extension_subjects(name: str) -> list[Subject]:
 
 
 def _chosen(names: Sequence[str]) -> list[Subject]:
+    """Return the rasterizers of these names, or without names all that this machine can run except `FAMILY`."""
     available = reachable()
     for name in names:
         if name not in available:

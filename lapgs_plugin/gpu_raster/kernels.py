@@ -43,11 +43,15 @@ REACH = tl.constexpr(3.33)
 """Standard deviations at which every footprint ends, as gsplat has it; fainter Gaussians end where alpha is 1/255."""
 BEYOND = tl.constexpr(0.3)
 """The Jacobian is that of a point this share of half the image beyond its border at most."""
-CENTRED, SIGMAS, LEAST_ROOT = tl.constexpr(JACOBIAN_LIMIT), tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
-"""The family's: the Jacobian's limit in half images from the centre, and numbers of its three-sigma radius."""
+CENTRED = tl.constexpr(JACOBIAN_LIMIT)
+"""The family's limit of the Jacobian, in half images from the centre."""
+SIGMAS, LEAST_ROOT = tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
+"""Constants of the family's three-sigma radius."""
 LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
-LEAST_SHARE, LEAST_AREA = tl.constexpr(MIN_SHARE), tl.constexpr(VANISHING)
-"""Where Gaussians are dimmed: lower bounds of the determinant without the blur over that with it, and of the first."""
+LEAST_SHARE = tl.constexpr(MIN_SHARE)
+"""Where Gaussians are dimmed: lower bound of the determinant without the blur over that with it."""
+LEAST_AREA = tl.constexpr(VANISHING)
+"""Where Gaussians are dimmed: lower bound of the determinant without the blur."""
 
 
 @triton.jit
@@ -398,9 +402,11 @@ def _store_shape_gradients(
     xx: tl.tensor, xy: tl.tensor, xz: tl.tensor, yy: tl.tensor, yz: tl.tensor, zz: tl.tensor, family: tl.constexpr,
     activated: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Store the gradients by quaternions and scales from those by xx, by xy and yx each, and so on, of covariances.
+    """Backpropagate from covariances to quaternions and scales, and store the gradients of these.
 
-    As in the family's CUDA code, that by its scales lacks the factor that they were multiplied by.
+    `xx` to `zz` are the gradients of the entries of the covariances. `xy` is that of xy and also that of yx.
+    The gradient is that of scales if `family` or `activated`, otherwise of their logarithms. As in the family's CUDA
+    code, it lacks the scale modifier, by which the scales were multiplied.
     """
     a, b, c, d, e, f, g, h, i = _rotation(w, x, y, z)
     # By the columns of the rotation, without their factor of twice the square of the scale.

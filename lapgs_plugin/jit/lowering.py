@@ -142,10 +142,12 @@ def _call(builder: Any, name: str, vector: Any, *operands: Any) -> Any:
 
 
 def _intrinsic(name: str) -> Callable[..., Any]:
+    """Return a function that emits a call of one of LLVM's intrinsics."""
     return lambda builder, vector, *operands: _call(builder, name, vector, *operands)
 
 
 def _comparison(predicate: str) -> Callable[..., Any]:
+    """Return a function that emits an ordered comparison of two vectors."""
     return lambda builder, vector, a, b: builder.fcmp_ordered(predicate, a, b)
 
 

@@ -639,7 +639,7 @@ def _quaternion_gradient(q: Lanes4, r0: Lanes3, r1: Lanes3, r2: Lanes3) -> Lanes
 
 @inline
 def _unit_backward(unit: Lanes4, length: Lanes, g: Lanes4) -> Lanes4:
-    """Return the gradient by the argument of `_unit` from that by its result."""
+    """Backpropagate through `_unit`: return the gradient of its argument, given `g`, the gradient of its result."""
     along = fma(unit[0], g[0], fma(unit[1], g[1], fma(unit[2], g[2], unit[3] * g[3])))
     along = select(length > MIN_NORM, along, 0.0)
     inverse = 1.0 / maximum(length, MIN_NORM)

@@ -133,7 +133,7 @@ class FieldRenderer:
 
     def background_of(self, level: int) -> Tensor:
         """Return the background (3,) of a level's field: black for a residual, which would add the colour again."""
-        return self._black if self.fields[level].signed else self._colored
+        return self._black if self.fields[level].signed else self._background
 
     def _stacks_at(self, cameras: Sequence[Camera], finest: int) -> bool:
         """Return whether to render these views in one set of launches. A batch shares its launches among its views."""
@@ -144,7 +144,7 @@ class FieldRenderer:
 
     def _render_stacked(self, camera: Camera, levels: Sequence[int]) -> Iterator[tuple[int, Tensor]]:
         with self._full_memory_explained(levels, level_camera(camera, levels[-1])):
-            background = self._colored if any(self.background) else None
+            background = self._background if any(self.background) else None
             images = self._stack(levels).render([level_camera(camera, level) for level in levels], background)
             for level, image in zip(levels, images, strict=True):
                 yield level, self._within_range(level, image[None])
@@ -208,10 +208,10 @@ class FieldRenderer:
 
     @cached_property
     def _black(self) -> Tensor:
-        return torch.zeros_like(self._colored)
+        return torch.zeros_like(self._background)
 
     @cached_property
-    def _colored(self) -> Tensor:
+    def _background(self) -> Tensor:
         """`background` (3,) on the device, copied once because a copy waits for the GPU."""
         return torch.tensor(self.background, dtype=self.fields[max(self.fields)].means.dtype, device=self.device)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.hierarchy.settings import AUTO, FREE_VIEWS
 from lapgs_plugin.options import check_values, option, option_name, require_positive
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
@@ -33,10 +33,6 @@ PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
 """Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
 FEW_PHOTOS = 40
 """Fewer training photos than that leave room for floaters."""
-FREE_VIEWS = 80
-"""Training views from which on MCMC's residuals have less of the weight of the mean opacity, in proportion to 1 /
-views. They start without colour, so that nothing holds their opacities against it, and lose detail; but few views do
-not show which detail is wrong elsewhere."""
 USUAL_EXTENT = 5.0
 """Extent of COLMAP's scenes, on which constants with a length were chosen. A fifth of the scene's extent is their unit,
 so that a scene trains alike in any units."""

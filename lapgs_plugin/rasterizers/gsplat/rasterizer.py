@@ -191,7 +191,7 @@ class GsplatRasterizer(Rasterizer):
 
     @property
     def can_stack(self) -> bool:
-        """See `fields.rasterizer.Rasterizer`. The stack calls our kernels or functions of gsplat."""
+        """Whether `stack` is available: on CUDA devices, unless gsplat renders packed."""
         return self._device.type == "cuda" and not self._stock.packed
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
