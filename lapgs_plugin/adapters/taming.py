@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-BASE_SHARE, FINEST_SHARE = 0.5, 1.0
-"""Share of the budget that the coarsest and the finest level end with; levels between are interpolated.
-
-The base has a fraction of the pixels and ends with half of the budget, which reduces the total work.
-"""
+BASE_SHARE = 0.5
+"""Share of the budget that the coarsest level ends with. It has a fraction of the pixels, and less work with fewer
+Gaussians."""
+FINEST_SHARE = 1.0
+"""Share of the budget that the finest level ends with; levels between are interpolated."""
 
 LOW_LOGIT = -1.0
 """Value that tells logits from opacities in a PLY: a trained field has logits down to about -5.3 (opacity 0.005, where

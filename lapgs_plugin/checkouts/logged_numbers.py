@@ -24,10 +24,16 @@ HARMLESS = ("no_grad()", "inference_mode()")
 CLOCKS = {"time", "time_ns", "perf_counter", "perf_counter_ns", "monotonic", "monotonic_ns", "process_time"}
 """Functions that read a clock of the processor."""
 
-READ, ELAPSED, ELAPSED_NOW = "_lapgs_read", "_lapgs_elapsed", "_lapgs_elapsed_now"
-"""Names of what takes the place of `x.item()`, and of `a.elapsed_time(b)` late and at once."""
-RECORD, NUMBER = "_lapgs_record", "_lapgs_number"
-"""Names of what takes the place of `a.record()`, and of what waits for a number."""
+READ = "_lapgs_read"
+"""Name of the function that takes the place of `x.item()`."""
+ELAPSED = "_lapgs_elapsed"
+"""Name of the function that takes the place of `a.elapsed_time(b)` where the number may be late."""
+ELAPSED_NOW = "_lapgs_elapsed_now"
+"""Name of the function that takes the place of `a.elapsed_time(b)` where the number is needed at once."""
+RECORD = "_lapgs_record"
+"""Name of the function that takes the place of `a.record()`."""
+NUMBER = "_lapgs_number"
+"""Name of the function that waits for a number."""
 
 
 class LateNumbers(Change):

@@ -31,19 +31,20 @@ from lapgs_plugin.reference_raster.oracle import footprint_radii, projection_jac
 
 NAME = "faster-gs"
 MODULE = "FasterGSCudaBackend.torch_bindings"
+"""Compiled module of Faster-GS."""
 INSTALL = (
     "pip install git+https://github.com/nerficg-project/faster-gaussian-splatting/#subdirectory=FasterGSCudaBackend "
     "--no-build-isolation"
 )
-"""Needs nvcc and a C++ compiler."""
+"""Command that installs it; needs nvcc and a C++ compiler."""
 ARGUMENTS = (
     *("means", "scales", "rotations", "opacities", "sh_coefficients_0", "sh_coefficients_rest"),
     *("densification_info", "rasterizer_settings"),
 )
-"""Of `diff_rasterize` on the branch main. That of FasterGSFused also takes Adam's moments."""
+"""Arguments of `diff_rasterize` on the branch main. That of FasterGSFused also takes Adam's moments."""
 FAR = 1e10
 OFFSET = 0.5
-"""The kernel adds it to SH values before it clamps them."""
+"""Number that the kernel adds to SH values before it clamps them."""
 
 LIMIT = "the limit of the projection's Jacobian is another, or its gradient is"
 SEMANTICS = Semantics(

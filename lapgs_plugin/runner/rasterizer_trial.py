@@ -16,21 +16,28 @@ from lapgs_plugin.runner.object_values import RasterOutputs, size_of
 from lapgs_plugin.runner.rasterizer_choice import Times, Trial
 from lapgs_plugin.runner.stage_rendering import Captured
 
-WARM_UP, REPEATS = 3, 7
-"""Renders before those that are timed, and those of which the median is taken."""
+WARM_UP = 3
+"""Renders before those that are timed."""
+REPEATS = 7
+"""Timed renders, of which the median is taken."""
 
 LATER_COUNT = 300_000
 """About how many Gaussians the family's models have after some thousand iterations."""
 
-PIXEL_TOLERANCE, PIXEL_SHARE = 4e-3, 1e-3
-"""A pixel agrees within the first, the step of an opacity of 1/255 that rounding may leave out. All but the second
-share of the pixels have to."""
+PIXEL_TOLERANCE = 4e-3
+"""Difference within which pixels agree: the step of an opacity of 1/255, which rounding may leave out."""
+PIXEL_SHARE = 1e-3
+"""Largest share of pixels that differ by more than `PIXEL_TOLERANCE`."""
 
-LARGE_TOLERANCE, LARGE_SHARE = 0.05, 1e-4
-"""Another order of two Gaussians at the same depth may change a pixel by more than the first. Few have such a pair."""
+LARGE_TOLERANCE = 0.05
+"""Difference of a pixel that another order of two Gaussians at the same depth may exceed."""
+LARGE_SHARE = 1e-4
+"""Largest share of pixels that differ by more than `LARGE_TOLERANCE`: few have such a pair."""
 
-RADIUS_TOLERANCE, RADIUS_SHARE = 1, 1e-3
-"""A radius agrees within a pixel, to which it is rounded up. All but this share of the Gaussians have to."""
+RADIUS_TOLERANCE = 1
+"""Difference in pixels within which radii agree: they are rounded up to pixels."""
+RADIUS_SHARE = 1e-3
+"""Largest share of Gaussians whose radii differ by more than `RADIUS_TOLERANCE`."""
 
 STRETCH = 0.5
 """Standard deviation of the logarithms by which the axes of compared Gaussians are stretched."""

@@ -13,8 +13,10 @@ from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.rasterizers.signed_color import ColorPath, signed_degree
 from lapgs_plugin.runner.object_values import fields_of, with_values
 
-BACKGROUNDS, DEGREES = ("bg", "bg_color", "background"), ("sh_degree", "active_sh_degree")
-"""Names that rasterizers give to these settings."""
+BACKGROUNDS = ("bg", "bg_color", "background")
+"""Names that rasterizers give to the setting of the background."""
+DEGREES = ("sh_degree", "active_sh_degree")
+"""Names that rasterizers give to the setting of the SH degree."""
 
 
 def signed_settings(settings: Any, path: ColorPath, zeros: Callable[[Tensor], Tensor]) -> Any:

@@ -21,15 +21,20 @@ from lapgs_plugin.gpu_raster.tiles import blend_in_tiles
 from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
 
 RULES = GSPLAT._replace(activated=True, alpha=True)
+"""Rules of projection."""
 WITH_ALPHAS = RULES._replace(depth=True)
-"""Rules of projection, and of blending where the opacity of the image has a gradient."""
+"""Rules of blending's backward pass where the opacity of the image has a gradient."""
 
-PLAIN, DEPTH_ONLY = "RGB", ("D", "ED")
+PLAIN = "RGB"
+"""Mode of rendering colours only."""
+DEPTH_ONLY = ("D", "ED")
+"""Modes of rendering depths only."""
 LEAST_ALPHA = 1e-10
 """Lower bound of the opacity by which "ED" divides, gsplat's."""
 NEAREST, FARTHEST = 0.01, 1e10
-"""Default planes of gsplat's."""
+"""Depths of gsplat's default near and far plane."""
 MOST_COEFFICIENTS = 16
+"""SH coefficients of a colour that the kernels can evaluate, those of degree 3."""
 MOST_NUMBERS = 2**31 - 1
 """Numbers of all Gaussians that the kernels can count."""
 

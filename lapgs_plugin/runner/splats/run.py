@@ -44,7 +44,9 @@ logger = logging.getLogger(__name__)
 NEEDED = ("cfg", "parser", "trainset", "valset", "splats", "optimizers")
 """Attributes of a script's trainer that are read or replaced."""
 RESULTS = "--result_dir"
+"""Option of the scripts that names the output folder."""
 OTHERWISE = "`lapgs run --off` runs the script as it is"
+"""Advice where levels cannot be trained."""
 HELD_OUT_EVERY = 8
 """Views of which one is held out where a manifest says that some are."""
 

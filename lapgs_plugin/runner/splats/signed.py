@@ -18,7 +18,9 @@ from lapgs_plugin.ops.upsample import upsample
 from lapgs_plugin.rasterizers.gsplat.stock import takes_viewmats
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+"""Signature of gsplat's `rasterization`: images, alphas, and what its strategies need."""
 COLORS = 3
+"""Channels of a colour."""
 DEPTH_ONLY = ("D", "ED")
 """Modes of `rasterization` without colours."""
 
