@@ -47,7 +47,10 @@ CENTRED = tl.constexpr(JACOBIAN_LIMIT)
 """The family's limit of the Jacobian, in half images from the centre."""
 SIGMAS, LEAST_ROOT = tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
 """Constants of the family's three-sigma radius."""
-LARGEST, OVERFLOWN = tl.constexpr(MAX_RADIUS), tl.constexpr(1e37)
+LARGEST = tl.constexpr(MAX_RADIUS)
+"""Largest radius of a Gaussian in pixels."""
+OVERFLOWN = tl.constexpr(1e37)
+"""Area or coordinate from which on a Gaussian is not drawn."""
 LEAST_SHARE = tl.constexpr(MIN_SHARE)
 """Where Gaussians are dimmed: lower bound of the determinant without the blur over that with it."""
 LEAST_AREA = tl.constexpr(VANISHING)

@@ -11,11 +11,11 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 
 TILE = 16
 """Pixels of a tile's side."""
-RECORD, COLOR_IN_RECORD = 12, 8
-"""Numbers of a Gaussian's record, which lies together in memory, and where its colour begins.
-
-They are x, y, conic (a, b, c), opacity, two without meaning, red, green, blue, and 1 / depth.
-"""
+RECORD = 12
+"""Numbers of a Gaussian's record, which lies together in memory: x, y, conic (a, b, c), opacity, two without meaning,
+red, green, blue, and 1 / depth."""
+COLOR_IN_RECORD = 8
+"""Index in a record at which its colour begins."""
 GRADIENT = 8
 """Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
 ALIGNMENT = 16

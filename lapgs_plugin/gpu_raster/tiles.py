@@ -24,10 +24,14 @@ from lapgs_plugin.gpu_raster.rules import Rules
 
 T = TypeVar("T")
 
-MARGIN, FORGOTTEN = 1.125, 0.02
-"""Room by the number of pairs of the last renders, and the share of it that is given up with each render."""
-LEAST_ROOM, MOST_PAIRS = 2**14, 2**31 - 2**9
-"""Pairs that there is always room for, and those whose places our kernels can number."""
+MARGIN = 1.125
+"""Room for pairs, by their number in the last renders."""
+FORGOTTEN = 0.02
+"""Share of that room that is given up with each render."""
+LEAST_ROOM = 2**14
+"""Pairs that there is always room for."""
+MOST_PAIRS = 2**31 - 2**9
+"""Most pairs whose places our kernels can number."""
 
 _rooms: dict[tuple[Any, ...], float] = {}  # by device, size and number of images; estimates
 

@@ -18,14 +18,21 @@ from lapgs_plugin.gpu_raster.records import TILE, grid_of
 from lapgs_plugin.reference_raster.layout import MAX_ALPHA
 
 WARP = 32
+"""Threads of a warp."""
 COLUMNS = 4
+"""Columns of pixels of a warp's region."""
 LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
 """A warp's threads: this many columns of pixels by this many Gaussians."""
-AT_ONCE, QUEUE = tl.constexpr(2 * WARP), tl.constexpr(4 * WARP)
-"""Pairs that a warp reads at once, and places in its queue: for as many and almost a bucket."""
+AT_ONCE = tl.constexpr(2 * WARP)
+"""Pairs that a warp reads at once."""
+QUEUE = tl.constexpr(4 * WARP)
+"""Places in a warp's queue of pairs: for as many as it reads at once, and almost a bucket."""
 LOG2_E = tl.constexpr(1.4426950408889634)
+"""Logarithm of e to base 2."""
 FAINTEST = tl.constexpr(1 / 255)
+"""Alpha below which a Gaussian does not blend into a pixel."""
 OPAQUEST, OPAQUEST_OF_FAMILY = tl.constexpr(0.999), tl.constexpr(MAX_ALPHA)
+"""Largest alpha of a Gaussian in a pixel: gsplat's, and the family's."""
 LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
 
