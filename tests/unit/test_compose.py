@@ -357,7 +357,7 @@ def test_each_field_has_a_stream_and_nothing_is_used_too_early(monkeypatch: pyte
     renderer = HierarchyRenderer(fields, 3, Pyramid(), rasterizer, BACKGROUND)
     expected = renderer.render(CAMERA)
     monkeypatch.setattr(FieldRenderer, "device", torch.device("cuda"))
-    monkeypatch.setattr(FieldRenderer, "_colored", torch.tensor(BACKGROUND))
+    monkeypatch.setattr(FieldRenderer, "_background", torch.tensor(BACKGROUND))
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: streams.log.append(("synchronize",)))
     monkeypatch.setattr(torch.cuda, "Stream", streams.make)
     monkeypatch.setattr(torch.cuda, "stream", streams.inside)
