@@ -26,6 +26,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, 
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.gpu_raster.cameras import CameraCache
 from lapgs_plugin.rasterizers.empty_images import companion, projected_centres, surely_blends
+from lapgs_plugin.rasterizers.gsplat.stock import is_differentiated
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import footprint_radii, projection_jacobians, world_covariances
 
@@ -113,7 +114,7 @@ class FasterGsRasterizer(Rasterizer):
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
     ) -> RenderResult:
         """Render `field`; see `fields.rasterizer.Rasterizer`."""
-        differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in field.parameters.values())
+        differentiated = is_differentiated(field)
         means2d = field.means.new_zeros(len(field), 2).requires_grad_(differentiated)
         image = self._image(field, camera, background, sh_degree, means2d if differentiated else None)
         with torch.no_grad():

@@ -108,13 +108,13 @@ class RunFiles:
         Args:
             entry: as `append_history` takes it.
         """
-        last = (self.history() or [{}])[-1]
-        if (last.get("level"), last.get("iteration")) != (entry["level"], entry["iteration"]):
+        entries = self.history()
+        if not entries or any(entries[-1][key] != entry[key] for key in ("level", "iteration")):
             self.append_history(entry)
             return
         self._require_lock()
         checked(entry, HistoryEntry, "the history entry", advice="it could not be read again")
-        self._write_history([*self.history()[:-1], last | entry])
+        self._write_history([*entries[:-1], entries[-1] | entry])
 
     def rewind_history(self, level: int, iteration: int) -> None:
         """Remove the entries after an iteration of a level, which a resumed run adds again.

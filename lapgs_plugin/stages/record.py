@@ -229,8 +229,8 @@ class StageRecord(LoopRecord):
 
     def weak_lines(self) -> list[str]:
         """Return a line for the user for each sign that the level that was archived last hardly matters."""
-        manifest = self.archive.manifest
-        gains = [finest_gains(last_view_psnrs(self.archive.history(), along=along)) for along in (True, False)]
+        manifest, history = self.archive.manifest, self.archive.history()
+        gains = [finest_gains(last_view_psnrs(history, along=along)) for along in (True, False)]
         return weak_levels(manifest.records[-1:], smaller_gains(*gains), manifest.settings)
 
     @contextmanager
