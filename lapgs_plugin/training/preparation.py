@@ -128,7 +128,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
             settings = fewer
             say(
                 f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
-                "over them; more gain little with so few photos, and --iterations asks for another number"
+                "over them; more gain little, and --iterations asks for another number"
             )
         if settings.time is not None:  # how long it may be is measured once the photos are read
             make_plan(size, settings, photos)

@@ -183,12 +183,12 @@ def test_few_views_for_many_iterations_are_named() -> None:
 
 def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happen() -> None:
     given = TrainSettings()
-    assert [given.for_photos(count).iterations for count in (3, 16, 17, 43, 99)] == [5000, 5000, 5100, 12_900, 29_700]
-    assert given.for_photos(100) is given
+    assert [given.for_photos(count).iterations for count in (3, 38, 39, 43, 230)] == [5000, 5000, 5070, 5590, 29_900]
+    assert given.for_photos(231) is given
     assert TrainSettings(iterations=3000).for_photos(43).iterations == 3000
     assert TrainSettings(protocol="paper").for_photos(43).iterations == 30_000
     assert TrainSettings(densification=Densification(until=9000)).for_photos(43).iterations == 30_000
-    assert TrainSettings(densification=Densification(reset_every=0)).for_photos(43).iterations == 12_900
+    assert TrainSettings(densification=Densification(reset_every=0)).for_photos(43).iterations == 5590
     assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
 
 
