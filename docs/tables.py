@@ -1,6 +1,6 @@
-"""Write the tables of README.md and docs/results.md from the measured runs in docs/data/.
+"""Write the tables of docs/results.md from the measured runs in docs/data/.
 
-Run `python docs/tables.py` after changing a data file; a test compares the documents with it. A table stands between
+Run `python docs/tables.py` after changing a data file; a test compares the document with it. A table stands between
 `<!-- table: NAME -->` and `<!-- end -->`. Each row of a data file is one run; a table shows means over seeds.
 
 `lapgs report RUN --csv docs/data/train.csv` appends the row of a measured run to train.csv. Replace
@@ -17,7 +17,7 @@ from statistics import fmean
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs/data"
-DOCUMENTS = (ROOT / "README.md", ROOT / "docs/results.md")
+DOCUMENTS = (ROOT / "docs/results.md",)
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 Run = Mapping[str, str]
@@ -126,20 +126,7 @@ def cpu() -> str:
     return markdown(["", "method", "seconds", "against one field", *columns, "runs"], rows)
 
 
-def headline() -> str:
-    """Return README's table: three scenes, one figure a cell."""
-    shown_methods, rows = [method for method in METHODS if method != "own script"], []
-    for (scene,), methods in grouped(runs_of("train"), "scene").items():
-        if scene not in ("bonsai", "train", "fox"):
-            continue
-        for unit, column, form in (("seconds", "seconds", "{:.0f}"), ("PSNR, dB", "psnr", "{:.1f}")):
-            cells = [shown(mean(methods.get(method, []), column), form) for method in shown_methods]
-            rows.append([scene_title(methods["nested"][0]) if unit == "seconds" else "", unit, *cells])
-    return markdown(["", "", *shown_methods], rows)
-
-
 TABLES: dict[str, Callable[[], str]] = {
-    "headline": headline,
     "train": train,
     "fastgs": lambda: checkouts(True),
     "forks": lambda: checkouts(False),

@@ -16,11 +16,18 @@ from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.untrusted import JSON_MIB, JSON_MIB_VARIABLE
 from tests.docs.documents import DOCUMENTS, PAGES, ROOT, commands, name_of, prose
 
-_spec = importlib.util.spec_from_file_location("tables", ROOT / "docs/tables.py")
-assert _spec is not None
-assert _spec.loader is not None
-tables = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tables)
+
+def _script(name: str) -> Any:
+    """Load a script that writes documents."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"docs/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+tables, curves = _script("tables"), _script("curves")
 
 WITH_COMMANDS = [path for path in PAGES if commands(path)]
 OF_OTHERS = {
@@ -135,6 +142,12 @@ def test_the_results_can_be_read_at_once() -> None:
 def test_tables_show_the_data_files(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
     assert tables.rewritten(text) == text, "run docs/tables.py"
+
+
+def test_curves_show_the_data_file() -> None:
+    assert curves.IMAGE.read_text(encoding="utf-8") == curves.drawn(curves.runs_of_data()), "run docs/curves.py"
+    runs = [{**run, "lpips": str(2 * float(run["lpips"]))} for run in curves.runs_of_data()]
+    assert curves.drawn(runs) != curves.drawn(curves.runs_of_data())
 
 
 def test_tables_show_means_over_seeds_and_ratios_to_the_baseline() -> None:
