@@ -1,7 +1,8 @@
-"""Read JSON and TOML that may be damaged, edited by hand or malicious.
+"""Read JSON, TOML and XML that may be damaged, edited by hand or malicious.
 
 All of this package reads such files here. Size, nesting and numbers are limited first; then values are validated
-against a type. Every error is one line with the file, the key, the value, the expectation and advice.
+against a type, those of XML by its reader. Every error is one line with the file, the key, the value, the expectation
+and advice.
 Readers of other formats call `require_regular` before they open a file.
 
 A type is anything that pydantic validates. Dataclasses with `STRICT` as their `__pydantic_config__`, and dictionaries
@@ -21,6 +22,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 from typing_extensions import TypedDict  # pydantic cannot read that of `typing` before Python 3.12
 
@@ -32,11 +34,13 @@ else:
     import tomli as tomllib
 
 if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
     from pydantic import TypeAdapter, ValidationError
 
 MIB = 2**20
 JSON_MIB = 32
-"""Largest JSON file with cameras or a history, in MiB. Other JSON files may have an eighth of that."""
+"""Largest JSON, XML or text file with cameras or a history, in MiB. Other JSON files may have an eighth of that."""
 BYTES_A_VALUE = 16
 """Bytes for each value that a file may hold: a file of at most n bytes may hold n / 16 values."""
 JSON_MIB_VARIABLE = "LAPGS_JSON_MIB"
@@ -175,9 +179,19 @@ def read_toml(
     return checked(value, kind, str(path), error=error, advice=advice, finite=finite)
 
 
-def read_text(path: Path, *, error: type[UserInputError] = UserInputError, advice: str = "restore it") -> str:
-    """Read a text file of at most `TEXT_BYTES`; arguments and errors as in `read_json`."""
-    data = _read(path, TEXT_BYTES, "expected a file written by hand", error, advice)
+def read_text(
+    path: Path, *, error: type[UserInputError] = UserInputError, advice: str = "restore it", written: bool = False
+) -> str:
+    """Read a text file; arguments and errors as in `read_json`.
+
+    Args:
+        path, error, advice: as `read_json` takes them.
+        written: a program wrote the file, which may then be as large as a JSON file; else at most `TEXT_BYTES`.
+    """
+    if written:
+        data = _read(path, *_written_limit(error), error, advice)
+    else:
+        data = _read(path, TEXT_BYTES, "expected a file written by hand", error, advice)
     try:
         return data.decode("utf-8-sig")  # editors on Windows write the mark
     except UnicodeDecodeError as cause:
@@ -185,6 +199,19 @@ def read_text(path: Path, *, error: type[UserInputError] = UserInputError, advic
             f"{path} is not readable: byte {cause.start} is {shortened(data[cause.start : cause.start + 1])}, expected "
             f"UTF-8 text; {advice}"
         ) from None
+
+
+def read_xml(path: Path, *, error: type[UserInputError] = UserInputError, advice: str = "restore it") -> Element:
+    """Read an XML file without a document type, in UTF-8; return its root. Arguments and errors as in `read_json`."""
+    text, (limit, how_to_raise) = read_text(path, error=error, advice=advice, written=True), _written_limit(error)
+    if text.count("<") > limit // BYTES_A_VALUE:
+        raise error(f"{path} has more than {limit // BYTES_A_VALUE:,} tags, the most that are read; {how_to_raise}")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities multiply
+        raise error(f"{path} declares a document type or entities, expected plain XML; {advice}")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as cause:
+        raise error(f"{path} is not readable as XML ({cause}); {advice}") from None
 
 
 def checked(
@@ -251,8 +278,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 def _read_json_bytes(path: Path, part: int, error: type[UserInputError], advice: str) -> bytes:
     """Read a JSON file of at most one `part`-th of the limit, with no more values than fit into that."""
-    whole = _json_bytes(error)
-    how_to_raise = f"set {JSON_MIB_VARIABLE} to more than {whole // MIB} if it is right"
+    whole, how_to_raise = _written_limit(error)
     data = _read(path, whole // part, how_to_raise, error, advice)
     most = whole // part // BYTES_A_VALUE
     if sum(data.count(mark) for mark in (b",", b"[", b"{")) > most:
@@ -260,12 +286,12 @@ def _read_json_bytes(path: Path, part: int, error: type[UserInputError], advice:
     return data
 
 
-def _json_bytes(error: type[UserInputError]) -> int:
-    """Return the size of the largest JSON file that is read."""
+def _written_limit(error: type[UserInputError]) -> tuple[int, str]:
+    """Return the size of the largest file that is read if a program wrote it, and how to raise that."""
     text = os.environ.get(JSON_MIB_VARIABLE, str(JSON_MIB))
     if not re.fullmatch("[1-9][0-9]{0,5}", text):
         raise error(f"{JSON_MIB_VARIABLE}={shortened(text)}: expected a number of MiB such as {4 * JSON_MIB}")
-    return int(text) * MIB
+    return int(text) * MIB, f"set {JSON_MIB_VARIABLE} to more than {text} if it is right"
 
 
 def _read(path: Path, limit: int, how_to_raise: str, error: type[UserInputError], advice: str) -> bytes:

@@ -13,9 +13,18 @@ from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.reports.folders import FOLDER_REPORTS
+from lapgs_plugin.scenes.exports.registry import SCENE_READERS
 from lapgs_plugin.training.strategies import STRATEGIES
 
-REGISTRIES: tuple[Registry[Any], ...] = (BACKBONES, SUPERVISIONS, RASTERIZERS, STRATEGIES, FOLDER_REPORTS, INSTALLED)
+REGISTRIES: tuple[Registry[Any], ...] = (
+    BACKBONES,
+    SUPERVISIONS,
+    RASTERIZERS,
+    STRATEGIES,
+    FOLDER_REPORTS,
+    INSTALLED,
+    SCENE_READERS,
+)
 """All that other packages can add to, but hooks."""
 
 

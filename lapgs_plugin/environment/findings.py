@@ -185,6 +185,7 @@ ENTRY_POINT_GROUPS = {
     f"{PACKAGE}.rasterizers": "--rasterizer {}",
     f"{PACKAGE}.reports": "lapgs report, of folders of kind {}",
     "lapgs.commands": "lapgs {}",
+    "lapgs.scenes": "a reader of scenes",
 }
 """Groups of entry points through which other packages extend this one, with the use of their entries."""
 

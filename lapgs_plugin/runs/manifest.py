@@ -67,7 +67,7 @@ class SceneReference:
         resolution: the resolution setting as the user wrote it, such as "1k" or "1/4".
         eval: whether every eighth view was held out.
         background: RGB in [0, 1] behind the base field.
-        kind: "colmap" or "transforms".
+        kind: "colmap", "transforms" or the program that exported the scene.
         images: name of the image folder in a COLMAP scene.
         masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
         unit: the length in the scene's units that is 1 for the rasterizer, see `scenes.Scene`.

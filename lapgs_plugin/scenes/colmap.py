@@ -66,10 +66,7 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
     sparse = read_model(model)
-    for camera in _used_cameras(sparse):
-        if distortion := _distortion(camera):
-            hint = undistort_hint(path, camera.model.name)
-            raise SceneError(f"{model}: camera {camera.camera_id} is distorted ({distortion}); {hint}")
+    refuse_distorted(sparse, path)
     folder = path / images
     source = source_of(with_bare_names(sparse, folder), folder)
     if not is_folder(folder):
@@ -77,6 +74,14 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         raise SceneError(f"{folder}: no such folder of images; {where_else(path, first)}")
     train, test = hold_out(source.train, evaluate)
     return replace(source, train=train, test=test, warnings=source.warnings + larger_model(path, model))
+
+
+def refuse_distorted(model: Model, path: Path) -> None:
+    """Raise a SceneError if an image of a model is distorted, with advice about the scene folder `path`."""
+    for camera in _used_cameras(model):
+        if distortion := _distortion(camera):
+            hint = undistort_hint(path, camera.model.name)
+            raise SceneError(f"{model.folder}: camera {camera.camera_id} is distorted ({distortion}); {hint}")
 
 
 def larger_model(path: Path, model: Path) -> tuple[str, ...]:

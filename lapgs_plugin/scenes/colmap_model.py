@@ -6,7 +6,7 @@ Other files of a model may be outdated, because scripts that edit models do not 
 from __future__ import annotations
 
 import struct
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from lapgs_plugin.errors import SceneError, counted
 from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes import colmap_binary, colmap_text
 from lapgs_plugin.scenes.colmap_frames import frame_poses
-from lapgs_plugin.scenes.colmap_records import Points, PosedImage
+from lapgs_plugin.scenes.colmap_records import NO_FEATURES, Points, PosedImage
 from lapgs_plugin.scenes.point_cloud import read_point_cloud
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -81,6 +81,28 @@ def read_model(folder: Path, observations: bool = False) -> Model:
     model = Model(folder, cameras, images, _read_points(points[0], observations))
     warnings = [model.points.warning] if model.points.warning else []
     return replace(model, warnings=(*warnings, *_contradictions(model, suffix, points)))
+
+
+def model_of(folder: Path, photos: Sequence[tuple[str, pycolmap.Camera, NDArray[np.float64]]], points: Points) -> Model:
+    """Return a model of posed photos, with one camera for all that have the same lens and size.
+
+    Args:
+        folder: names the model in messages.
+        photos: name, lens, and world to camera (4, 4) of each.
+        points: of the model.
+    """
+    cameras: dict[tuple[object, ...], pycolmap.Camera] = {}
+    images: dict[int, PosedImage] = {}
+    for number, (name, lens, pose) in enumerate(photos, start=1):
+        key = (lens.model, lens.width, lens.height, *lens.params)
+        if key not in cameras:
+            own = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+            own.camera_id = len(cameras) + 1
+            cameras[key] = own
+        x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
+        numbers = np.array([w, x, y, z, *pose[:3, 3]])
+        images[number] = PosedImage(name, cameras[key].camera_id, numbers, NO_FEATURES)
+    return Model(folder, {camera.camera_id: camera for camera in cameras.values()}, images, points)
 
 
 def count_images(folder: Path) -> int:

@@ -183,6 +183,21 @@ def read_image(
     return image.contiguous()
 
 
+def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
+    """Read the first channel of a depth map, (h, w); floating-point values as they are, integers times `unit`.
+
+    Raises:
+        SceneError: the file is missing, no image, or has more pixels than `limits.PHOTO_PIXELS`.
+    """
+    source = _open(path, pixels=True)
+    _image_plane(path, source)
+    spec = source.spec()
+    values = _read_rows(path, source, 0, spec.height, 1)[:, :, 0]
+    if spec.format.basetype in FLOAT_FORMATS:
+        return values
+    return values * np.float32(unit * (2 ** (8 * spec.format.size()) - 1))  # 1 is the largest integer
+
+
 def read_as_3dgs(path: Path, size: tuple[int, int], background: tuple[float, float, float] | None) -> Tensor:
     """Read an image as 3DGS codebases do: decoded and resized by Pillow in 8 bits.
 

@@ -23,6 +23,7 @@ from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, places_of
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
+from lapgs_plugin.scenes.exports.registry import find_export, read_export
 from lapgs_plugin.scenes.images import image_size, not_there, read_as_3dgs, read_image, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
     ALPHA,
@@ -113,7 +114,7 @@ class Scene:
 
     Attributes:
         path: the scene folder.
-        kind: "colmap" or "transforms".
+        kind: "colmap", "transforms" or the program that exported it, such as "metashape".
         train: training views in name order, at least two.
         test: held-out views in name order; none by default.
         points: (n, 3) float32 positions of the sparse points, in world units, n at least 1.
@@ -153,7 +154,7 @@ def load_scene(
     check: Callable[[tuple[int, int], int], None] | None = None,
     hold: bool = True,
 ) -> Scene:
-    """Load a COLMAP scene (`images/`, `sparse/0/`) or a transforms scene (`transforms*.json`) with all its images.
+    """Load a COLMAP scene (`images/`, `sparse/0/`), a transforms scene or another program's export with all its images.
 
     Cameras and points are checked before any image is read. Views may differ in size.
 
@@ -295,9 +296,12 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
             source = replace(source, warnings=(*source.warnings, line))
     elif has_transforms(path):
         source = read_transforms(path, images, evaluate)
+    elif (export := find_export(path)) is not None:
+        source = read_export(export, path, images, evaluate)
     else:
         raise SceneError(
-            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json in it; {_advice_about(path)}"
+            f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json, nor an export of another "
+            f"program in it; {_advice_about(path)}"
         )
     check_source(path, source)
     return source

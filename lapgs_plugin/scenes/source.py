@@ -52,7 +52,7 @@ class SceneSource:
     """The frames and points of a scene.
 
     Attributes:
-        kind: layout, "colmap" or "transforms".
+        kind: layout, "colmap", "transforms" or the program that exported it.
         train, test: in name order.
         points: (n, 3) float64 positions in world units.
         colors: (n, 3) float64 RGB in [0, 1].

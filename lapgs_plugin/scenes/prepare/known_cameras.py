@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from lapgs_plugin.errors import SceneError, UserInputError
-from lapgs_plugin.files import is_file
+from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.options import option_name
 from lapgs_plugin.scenes.blender import FISHEYE, SINGLE_FILE, Lenses, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import (
@@ -26,8 +26,9 @@ from lapgs_plugin.scenes.colmap import (
     source_of,
     with_bare_names,
 )
-from lapgs_plugin.scenes.colmap_model import Model, count_images, read_model
-from lapgs_plugin.scenes.colmap_records import NO_FEATURES, NO_TRACK, Points, PosedImage
+from lapgs_plugin.scenes.colmap_model import Model, count_images, model_of, read_model
+from lapgs_plugin.scenes.colmap_records import NO_TRACK, Points
+from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
@@ -82,7 +83,7 @@ class KnownCameras:
 
 
 def find_known_cameras(photos: Path, settings: PrepareSettings) -> Path | None:
-    """Return the folder of the model of photos, or of their transforms file; None if there are only photos.
+    """Return the folder of the model of photos, their transforms file or their export; None if there are only photos.
 
     An undistorted model is the one that `lapgs train` reads. Of several distorted models the largest is taken.
 
@@ -91,12 +92,14 @@ def find_known_cameras(photos: Path, settings: PrepareSettings) -> Path | None:
         SceneError: the model cannot be read.
     """
     if settings.model is not None:
-        if (named := find_model(settings.model, (".", "0", *MODEL_PLACES))) is None:
+        if (named := find_model(settings.model, (".", "0", *MODEL_PLACES))) is not None:
+            return largest_model(settings.model, named)
+        if not is_folder(settings.model) or find_export(settings.model) is None:
             raise UserInputError(
                 f"--model {settings.model}: no model of COLMAP in it, expected a folder with cameras, images and "
-                "points3D"
+                "points3D, or with another program's export of cameras"
             )
-        return largest_model(settings.model, named)
+        return settings.model
     trained = find_model(photos)
     if trained is None and has_transforms(photos):
         return photos
@@ -105,7 +108,9 @@ def find_known_cameras(photos: Path, settings: PrepareSettings) -> Path | None:
             logger.warning(line)
         return trained
     distorted = trained or find_model(photos, MODEL_PLACES)
-    return None if distorted is None else largest_model(photos, distorted)
+    if distorted is not None:
+        return largest_model(photos, distorted)
+    return photos if is_folder(photos) and find_export(photos) is not None else None
 
 
 def read_known_cameras(cameras: Path, photos: Path, settings: PrepareSettings) -> KnownCameras:
@@ -126,13 +131,15 @@ def read_known_cameras(cameras: Path, photos: Path, settings: PrepareSettings) -
                 f"{option_name(field)}: {cameras} has the cameras already; leave the option out, or give a folder of "
                 "photos without a model"
             )
-    transforms = find_model(cameras, (".",)) is None
-    model, source, folder = (_from_transforms if transforms else _from_model)(cameras, photos)
+    colmap = find_model(cameras, (".",)) is not None
+    transforms = not colmap and cameras == photos and has_transforms(cameras)
+    read = _from_model if colmap else _from_transforms if transforms else _from_export
+    model, source, folder = read(cameras, photos)
     frames = source.train
     present = tuple(frame for frame in frames if is_file(frame.path))
     left_out = sorted({frame.name for frame in frames} - {frame.name for frame in present})
     if frames and not present:
-        advice = "put them there" if transforms else "give the folder of the photos, and the model with --model"
+        advice = "give the folder of the photos, and the model with --model" if colmap else "put them there"
         first = min(frame.path for frame in frames)
         raise SceneError(f"{first}: no such image, nor any other of the {len(frames)} of {cameras}; {advice}")
     straight = {model.cameras[image.camera_id].model.name for image in model.images.values()} <= STRAIGHT
@@ -169,10 +176,12 @@ def _from_transforms(cameras: Path, photos: Path) -> tuple[Model, SceneSource, P
     """Return a model of a transforms file, its frames and points, and the folder of its photos."""
     lenses: Lenses = {}
     source = read_transforms(photos, "images", False, lenses)
-    top = common_folder([frame.name for frame in source.train])
-    frames = tuple(replace(frame, name=frame.name.removeprefix(top)) for frame in source.train)
-    source = replace(source, train=frames)
-    model = _model_of(cameras, source, lenses)
+    source = _without_top(source)
+    frames = source.train
+    posed = [
+        (frame.name, _colmap_lens(frame, *lenses[frame.path]), frame.camera.world_to_camera.numpy()) for frame in frames
+    ]
+    model = model_of(cameras, posed, Points(source.points, 255.0 * source.colors))
     other = find_model(photos, MODEL_PLACES)
     if other is not None and (count := count_images(other)) != len(frames):
         logger.warning(
@@ -181,6 +190,25 @@ def _from_transforms(cameras: Path, photos: Path) -> tuple[Model, SceneSource, P
         )
     _check_lenses(model)
     return model, source, photos
+
+
+def _from_export(cameras: Path, photos: Path) -> tuple[Model, SceneSource, Path]:
+    """Return a model of another program's export, its frames and points, and the folder of its photos."""
+    found = find_export(cameras)
+    assert found is not None  # `find_known_cameras` has found it
+    model, source = found.read(photos)
+    _check_lenses(model)
+    short = _without_top(source)
+    names = {long.name: frame.name for long, frame in zip(source.train, short.train, strict=True)}
+    images = {key: replace(image, name=names[image.name]) for key, image in model.images.items()}
+    points = Points(source.points, 255.0 * source.colors)  # random ones, too, which checkouts need
+    return replace(model, images=images, points=points), short, photos
+
+
+def _without_top(source: SceneSource) -> SceneSource:
+    """Return the source with names of photos without the folder that all are in."""
+    top = common_folder([frame.name for frame in source.train])
+    return replace(source, train=tuple(replace(frame, name=frame.name.removeprefix(top)) for frame in source.train))
 
 
 def _fit(source: SceneSource) -> tuple[int, bool]:
@@ -200,24 +228,6 @@ def _check_lenses(model: Model) -> None:
             raise SceneError(f"{subject}: {ALL_AROUND_HINT}")
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{subject} has NaN or inf in its parameters; reconstruct or export it again")
-
-
-def _model_of(folder: Path, source: SceneSource, lenses: Lenses) -> Model:
-    """Return frames and points of a transforms file as a model of COLMAP."""
-    cameras: dict[str, pycolmap.Camera] = {}
-    images: dict[int, PosedImage] = {}
-    for number, frame in enumerate(source.train, start=1):
-        camera = frame.camera
-        kind, distortion = _colmap_lens(frame, *lenses[frame.path])
-        values = [camera.fx, camera.fy, camera.cx, camera.cy, *distortion]
-        lens = pycolmap.Camera(model=kind, width=camera.width, height=camera.height, params=values)
-        lens.camera_id = len(cameras) + 1
-        key = cameras.setdefault(repr((camera.size, kind, values)), lens).camera_id
-        pose = camera.world_to_camera.numpy()
-        x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
-        images[number] = PosedImage(frame.name, key, np.array([w, x, y, z, *pose[:3, 3]]), NO_FEATURES)
-    by_id = {camera.camera_id: camera for camera in cameras.values()}
-    return Model(folder, by_id, images, Points(source.points, 255.0 * source.colors))
 
 
 def _reconstruction(model: Model, names: Collection[str]) -> pycolmap.Reconstruction:
@@ -248,7 +258,15 @@ def _reconstruction(model: Model, names: Collection[str]) -> pycolmap.Reconstruc
     return result
 
 
-def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> tuple[str, list[float]]:
+def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> pycolmap.Camera:
+    """Return COLMAP's camera for a lens of a transforms file and its distortion."""
+    model, terms = _colmap_distortion(frame, kind, distortion)
+    camera = frame.camera
+    params = [camera.fx, camera.fy, camera.cx, camera.cy, *terms]
+    return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
+
+
+def _colmap_distortion(frame: Frame, kind: str, distortion: Mapping[str, object]) -> tuple[str, list[float]]:
     """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
     if kind in PINHOLE_MODELS and not distortion:
         return "PINHOLE", []

@@ -1,0 +1,1 @@
+"""Read exports of other programs as scenes: one file for each program, which another package can add to."""

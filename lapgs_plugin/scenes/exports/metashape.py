@@ -1,0 +1,202 @@
+"""Read the cameras of Agisoft Metashape: File > Export > Export Cameras > Agisoft XML.
+
+The lens models are those of appendix D of its user manual.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+
+from lapgs_plugin.errors import SceneError
+from lapgs_plugin.scenes.exports.base import (
+    EXPORT_AGAIN,
+    Array,
+    Export,
+    PhotoFinder,
+    SceneReader,
+    Shot,
+    from_world,
+    image_side,
+    lens,
+    number,
+    numbers,
+    only_file,
+    perspective,
+    skipped,
+    unknown_lens,
+)
+from lapgs_plugin.scenes.exports.points import points_beside, seen_share
+from lapgs_plugin.scenes.source import ALL_AROUND
+from lapgs_plugin.untrusted import read_xml, shortened
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+    from lapgs_plugin.scenes.point_cloud import PointCloud
+
+LENSES = ("frame", "fisheye", "spherical")
+FAR = 1e4
+"""Distance from the origin, in extents of the cameras, of coordinates of the earth."""
+SEEN = 0.1
+"""Share of the points that cameras see at least if they are in the same coordinates."""
+
+
+@dataclass(frozen=True, eq=False)
+class _World:
+    """A similarity transform from a chunk to its world."""
+
+    turn: Array  # (3, 3)
+    shift: Array  # (3,)
+    scale: float
+
+    def placed(self, pose: Array, where: str) -> Array:
+        """Return world to camera of a camera's pose in the chunk (4, 4), camera to chunk."""
+        return from_world(self.turn @ pose[:3, :3], self.scale * self.turn @ pose[:3, 3] + self.shift, where)
+
+
+CHUNK = _World(np.eye(3), np.zeros(3), 1.0)
+
+
+class Metashape(SceneReader):
+    """Read one chunk. Its points are those of a PLY beside the XML."""
+
+    title = "cameras of Metashape (XML)"
+
+    def find(self, folder: Path) -> Path | None:
+        """Return the XML file."""
+        return only_file(folder, ".xml", lambda head: "<document version=" in head, self.title)
+
+    def read(self, source: Path, photos: PhotoFinder) -> Export:
+        """Read the aligned, enabled cameras of the chunk's largest component."""
+        chunk = _only_chunk(source)
+        cameras = chunk.findall("cameras//camera")
+        if not cameras:
+            raise SceneError(
+                f"{source}: the chunk {shortened(chunk.get('label', ''))} has no cameras, expected aligned photos; "
+                "align them and export the cameras again"
+            )
+        lenses = {sensor.get("id", ""): _lens(sensor, source) for sensor in chunk.findall("sensors/sensor")}
+        enabled = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
+        aligned = [
+            camera
+            for camera in enabled
+            if camera.find("transform") is not None and lenses.get(camera.get("sensor_id", "")) is not None
+        ]
+        if not aligned:
+            raise SceneError(
+                f"{source}: none of its {len(cameras)} cameras is aligned and enabled; align the photos and export the "
+                "cameras again"
+            )
+        component, count = Counter(camera.get("component_id") for camera in aligned).most_common(1)[0]
+        used = [camera for camera in aligned if camera.get("component_id") == component]
+        poses = {id(camera): _pose(camera, source) for camera in used}
+        cloud = points_beside(source)
+        world, warnings = _fitting_world(source, _world(chunk, component, source), list(poses.values()), cloud)
+        shots = []
+        for camera in used:
+            where, known = _named(source, camera), lenses[camera.get("sensor_id", "")]
+            assert known is not None  # or it was left out
+            shots.append(Shot(photos(camera.get("label", "")), known, world.placed(poses[id(camera)], where)))
+        if cloud is not None and seen_share(cloud.xyz, shots) < SEEN:
+            warnings += (
+                f"{source}: the cameras see few of the points beside it, which are not used; export both in the "
+                "same coordinate system",
+            )
+            cloud = None
+        reasons = {
+            "disabled": len(cameras) - len(enabled),
+            "not aligned": len(enabled) - len(aligned),
+            "in smaller components": len(aligned) - count,
+        }
+        return Export(source, tuple(shots), cloud, (*warnings, *skipped(source, reasons, len(cameras))))
+
+
+def _only_chunk(source: Path) -> Element:
+    root = read_xml(source, error=SceneError, advice=EXPORT_AGAIN)
+    chunks = root.findall("chunk")
+    if root.tag != "document" or len(chunks) != 1:
+        labels = ", ".join(shortened(chunk.get("label", "")) for chunk in chunks[:3])
+        raise SceneError(
+            f"{source}: it holds {len(chunks)} chunks{f' ({labels})' if labels else ''}, expected one; merge or "
+            "choose one in Metashape, and export its cameras"
+        )
+    return chunks[0]
+
+
+def _named(source: Path, camera: Element) -> str:
+    return f"{source}: camera {shortened(camera.get('label', ''))}"
+
+
+def _pose(camera: Element, source: Path) -> Array:
+    """Return a camera's pose (4, 4), camera to chunk, in COLMAP's axes."""
+    where = f"the transform of {_named(source, camera)}"
+    return numbers(camera.findtext("transform"), 16, where).reshape(4, 4)
+
+
+def _world(chunk: Element, component: str | None, source: Path) -> _World:
+    """Return the transform of a component, or that of the chunk in files of older versions."""
+    own = [item for item in chunk.findall("components/component") if item.get("id") == component]
+    known = [item for parent in (*own, chunk) if (item := parent.find("transform")) is not None]
+    transform = known[0] if known else None
+    if transform is None:
+        return CHUNK
+    turn, shift, scale = (transform.findtext(name) for name in ("rotation", "translation", "scale"))
+    where = f"{source}: the chunk's"
+    return _World(
+        np.eye(3) if turn is None else numbers(turn, 9, f"{where} rotation").reshape(3, 3),
+        np.zeros(3) if shift is None else numbers(shift, 3, f"{where} translation"),
+        1.0 if scale is None else number(scale, f"{where} scale"),
+    )
+
+
+def _fitting_world(
+    source: Path, world: _World, poses: list[Array], cloud: PointCloud | None
+) -> tuple[_World, tuple[str, ...]]:
+    """Return the coordinates to train in: the chunk's own where its world is the earth, unless points are in that."""
+    centers = np.stack([pose[:3, 3] for pose in poses])
+    extent = world.scale * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if np.linalg.norm(world.scale * world.turn @ centers.mean(axis=0) + world.shift) <= FAR * extent:
+        return world, ()
+    if cloud is not None:
+        camera = lens("SIMPLE_PINHOLE", (2, 2), [1.0, 1.0, 1.0])
+        placed = [Shot(source, camera, world.placed(pose, str(source))) for pose in poses]
+        if seen_share(cloud.xyz, placed) >= SEEN:
+            return world, ()
+    return CHUNK, (f"{source}: its world is the earth's; the chunk's own coordinates and units are used",)
+
+
+def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
+    """Return a sensor's adjusted lens, else its initial one; None if it is not calibrated."""
+    known = sensor.findall("calibration")
+    calibration = next((one for one in known if one.get("class") == "adjusted"), known[-1] if known else None)
+    if calibration is None:
+        return None
+    where = f"{source}: sensor {shortened(sensor.get('label', ''))}"
+    resolution = calibration.find("resolution")
+    sides: Mapping[str, str] = {} if resolution is None else resolution.attrib
+    width, height = (image_side(sides.get(side), f"{where}: its {side}") for side in ("width", "height"))
+    kind = calibration.get("type", "frame")
+    if kind not in LENSES:
+        raise unknown_lens(where, kind, LENSES[:2])
+    if kind == "spherical":
+        return lens(ALL_AROUND, (width, height), [width, height])
+
+    def term(name: str) -> float:
+        return number(calibration.findtext(name, "0"), f"{where}: its {name}")
+
+    f, b1, b2, p1, p2 = (term(name) for name in ("f", "b1", "b2", "p1", "p2"))
+    if b2:
+        raise SceneError(f"{where} has the skew b2 = {b2:g}, which COLMAP's lenses lack; align again without b1 and b2")
+    focal, center = (f + b1, f), (width / 2.0 + term("cx"), height / 2.0 + term("cy"))
+    radial = [term(f"k{power}") for power in range(1, 5)]
+    # OpenCV's p1 is the term along y, Metashape's that along x.
+    if kind == "frame":
+        return perspective((width, height), focal, center, radial, (p2, p1), where=where)
+    return lens("THIN_PRISM_FISHEYE", (width, height), [*focal, *center, *radial[:2], p2, p1, *radial[2:], 0.0, 0.0])
