@@ -23,7 +23,7 @@ def prepare(
         typer.Argument(
             metavar="PHOTOS",
             help="Folder of JPEG, PNG, TIFF, BMP, WebP or HEIC photos of a static scene, a video, or a scene folder of "
-            "COLMAP or nerfstudio, whose cameras are kept.",
+            "COLMAP, nerfstudio or another program's export, whose cameras are kept.",
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Scene folder to write.")],

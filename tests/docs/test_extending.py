@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -33,6 +34,7 @@ from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext, en
 from lapgs_plugin.patching.engine import find_targets, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
+from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.cli.run_folder import write_run, write_scene
 from tests.docs.documents import ROOT, blocks
@@ -209,6 +211,20 @@ def test_the_rasterizer_blends_front_to_back_and_leaves_statistics() -> None:
 
 
 @pytest.mark.usefixtures("installed")
+def test_the_reader_makes_a_scene(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for name in ("a.png", "b.png"):
+        Image.new("RGB", (64, 48), (90, 120, 150)).save(tmp_path / "images" / name)
+    (tmp_path / "capture.csv").write_text("a,0,0,0\nb,0.5,0.25,-1\n")
+    scene = load_scene(tmp_path, progress=False)
+    assert scene.kind == "capture_csv"
+    assert [view.camera.position.tolist() for view in scene.train] == [[0, 0, 0], [0.5, 0.25, -1]]
+    (tmp_path / "capture.csv").write_text("a,0,0,0\nb,0,nan,0\n")
+    with pytest.raises(UserInputError, match="b is '0 nan 0', expected 3 finite numbers"):
+        load_scene(tmp_path, progress=False)
+
+
+@pytest.mark.usefixtures("installed")
 def test_the_command_prints_the_levels_of_a_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), levels=2)
     records = lapgs_plugin.RunArchive.open(run).manifest.records
@@ -259,7 +275,17 @@ def test_no_file_on_the_page_is_without_a_test() -> None:
         "pyproject.toml",
         *(
             f"my_extension/{name}.py"
-            for name in ("hooks", "depth", "supervision", "backbone", "strategy", "rasterizer", "sizes", "report")
+            for name in (
+                "hooks",
+                "depth",
+                "supervision",
+                "backbone",
+                "strategy",
+                "rasterizer",
+                "scenes",
+                "sizes",
+                "report",
+            )
         ),
     }
     operation = {f"lapgs_plugin/ops/tone/{name}.py" for name in ("__init__", "in_torch", "in_triton")}

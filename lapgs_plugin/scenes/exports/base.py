@@ -21,7 +21,7 @@ from lapgs_plugin.scenes.colmap_records import file_name
 from lapgs_plugin.scenes.images import find_image, image_size, is_photo
 from lapgs_plugin.scenes.masks import has_photo_suffix
 from lapgs_plugin.scenes.point_cloud import PointCloud
-from lapgs_plugin.scenes.source import LARGEST
+from lapgs_plugin.scenes.source import ALL_AROUND_HINT, LARGEST
 from lapgs_plugin.untrusted import shortened
 
 Array = NDArray[np.float64]
@@ -34,6 +34,7 @@ NOT_RIGID = 1e-3
 """Largest error of a rotation matrix; files round to a few digits."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """From axes of OpenGL (x right, y up, z backwards) to those of COLMAP (x right, y down, z forward), and back."""
+ALL_AROUND_LENSES = ("spherical", "equirectangular")
 EXPORT_AGAIN = "export it again"
 
 
@@ -169,7 +170,7 @@ def _head(file: Path) -> str:
         return ""
 
 
-def numbers(text: str | Sequence[Any] | None, count: int, where: str) -> Array:
+def numbers(text: Any, count: int, where: str) -> Array:
     """Return numbers of a text, separated by spaces, or of a list.
 
     Raises:
@@ -184,12 +185,12 @@ def numbers(text: str | Sequence[Any] | None, count: int, where: str) -> Array:
     return values
 
 
-def number(text: str | float | None, where: str) -> float:
-    """Return one number as `numbers` does."""
-    return float(numbers(text if isinstance(text, str) else [text], 1, where)[0])
+def number(value: Any, where: str) -> float:
+    """Return one number of text or JSON; errors as of `numbers`."""
+    return float(numbers(value if isinstance(value, str | list | dict | None) else [value], 1, where)[0])
 
 
-def image_side(value: str | float | None, where: str) -> int:
+def image_side(value: Any, where: str) -> int:
     """Return a width or height in pixels as a whole number; errors as of `numbers`."""
     side = number(value, where)
     if side < 1 or side != int(side):
@@ -256,7 +257,9 @@ def lens(model: str, size: tuple[int, int], params: Sequence[float]) -> pycolmap
 
 
 def unknown_lens(where: str, kind: object, known: Sequence[str]) -> SceneError:
-    """Return the error for a lens model that is not known here."""
+    """Return the error for a lens model that is not known here, or sees all around."""
+    if kind in ALL_AROUND_LENSES:
+        return SceneError(f"{where} has the lens model {kind}: {ALL_AROUND_HINT}")
     return SceneError(
         f"{where} has the lens model {shortened(kind)}, expected {', '.join(known)}; undistort the photos in the "
         "program that wrote it, and export these with their pinhole cameras"

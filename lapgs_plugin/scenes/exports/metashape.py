@@ -33,7 +33,6 @@ from lapgs_plugin.scenes.exports.base import (
     unknown_lens,
 )
 from lapgs_plugin.scenes.exports.points import points_beside, seen_share
-from lapgs_plugin.scenes.source import ALL_AROUND
 from lapgs_plugin.untrusted import read_xml, shortened
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 
     from lapgs_plugin.scenes.point_cloud import PointCloud
 
-LENSES = ("frame", "fisheye", "spherical")
+LENSES = ("frame", "fisheye")
 FAR = 1e4
 """Distance from the origin, in extents of the cameras, of coordinates of the earth."""
 SEEN = 0.1
@@ -184,9 +183,7 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
     width, height = (image_side(sides.get(side), f"{where}: its {side}") for side in ("width", "height"))
     kind = calibration.get("type", "frame")
     if kind not in LENSES:
-        raise unknown_lens(where, kind, LENSES[:2])
-    if kind == "spherical":
-        return lens(ALL_AROUND, (width, height), [width, height])
+        raise unknown_lens(where, kind, LENSES)
 
     def term(name: str) -> float:
         return number(calibration.findtext(name, "0"), f"{where}: its {name}")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from lapgs_plugin.errors import SceneError, counted
+from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes.exports.base import (
     EXPORT_AGAIN,
@@ -28,10 +28,10 @@ from lapgs_plugin.scenes.exports.base import (
     number,
     numbers,
     perspective,
+    skipped,
     unknown_lens,
 )
 from lapgs_plugin.scenes.point_cloud import PointCloud
-from lapgs_plugin.scenes.source import ALL_AROUND
 from lapgs_plugin.untrusted import read_json, shortened
 
 FILES = (
@@ -42,8 +42,6 @@ FILES = (
 )
 """Where cameras are, in the order in which they are looked for."""
 LENSES = ("perspective", "simple_radial", "radial", "brown", "fisheye", "fisheye_opencv")
-ALL_AROUND_LENSES = ("spherical", "equirectangular")
-"""Names of OpenSfM for photos that see all around."""
 
 Values = Mapping[str, Any]
 
@@ -78,8 +76,7 @@ class OpenSfM(SceneReader):
         if not shots:
             raise SceneError(f"{source}: no shots in it, expected posed photos; reconstruct them again")
         total = sum(len(_table(source, other, "shots")) for other in parts)
-        separate = f"{source}: {len(parts)} separate reconstructions with {counted(total, 'photo')}"
-        warnings = (f"{separate}; the largest, of {len(shots)}, is used",) if len(parts) > 1 else ()
+        warnings = skipped(source, {"in smaller reconstructions": total - len(shots)}, total)
         return Export(source, tuple(shots), _points(source, _table(source, part, "points")), warnings)
 
 
@@ -147,8 +144,6 @@ def _lens(where: str, camera: Any) -> pycolmap.Camera:
     values = camera if isinstance(camera, dict) else {}
     kind = values.get("projection_type")
     width, height = (image_side(values.get(side), f"{where}: {side}") for side in ("width", "height"))
-    if kind in ALL_AROUND_LENSES:
-        return lens(ALL_AROUND, (width, height), [width, height])
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)
 

@@ -62,8 +62,8 @@ class PrepareSettings:
     )
     model: Path | None = option(
         None,
-        "Folder of a COLMAP model of the photos, such as sparse/0: take its cameras and only undistort. Default: the "
-        "model in PHOTOS, if there is one.",
+        "Folder of a COLMAP model of the photos, such as sparse/0, or of another program's export: take its cameras "
+        "and only undistort. Default: the model or export in PHOTOS, if there is one.",
     )
 
     def __post_init__(self) -> None:
