@@ -28,6 +28,7 @@ from lapgs_plugin.runner.stage_pruning import require_pruning
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import require_place, require_room, require_utf8
 from lapgs_plugin.runs.manifest import Manifest, read_manifest
+from lapgs_plugin.scenes.scene import require_colmap_or_transforms
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
         require_utf8(folder, "-m")
     if not source.exists():
         raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
+    require_colmap_or_transforms(source)
     if settings.images_on == "disk":  # that of the run: the one of temporary files may be in memory
         images.keep_on_disk(next(filter(is_folder, (absolute, *absolute.parents))))
     with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:

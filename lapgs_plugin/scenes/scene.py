@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from shlex import quote
@@ -307,11 +308,23 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
     return source
 
 
+def require_colmap_or_transforms(path: Path) -> None:
+    """Raise a SceneError with advice if a scene folder holds another program's export, which no checkout reads."""
+    if find_model(path) is None and not has_transforms(path) and (export := find_export(path)) is not None:
+        raise SceneError(
+            f"{export.source}: checkouts do not read this format, expected COLMAP's; write it with `lapgs prepare "
+            f"{quote(str(path))} OUT`"
+        )
+
+
 def _advice_about(path: Path) -> str:
     """Return the advice for a folder that is no scene: the scene in it or around it, or the photos in it."""
     if find_model(path, MODEL_PLACES) is not None:
         return f"make a scene of its photos and its model with `lapgs prepare {quote(str(path))} OUT`"
     inside = [path / "dense" / "0", *sorted(path.glob("*"))]  # the first is that of COLMAP's automatic reconstructor
+    with suppress(SceneError):
+        if (export := next(filter(find_export, filter(is_folder, inside)), None)) is not None:
+            return f"give {export}, which has one"
     folders = [*inside, *path.parents[:3]]
     if (scene := next((inner for inner in folders if find_model(inner) or has_transforms(inner)), None)) is not None:
         return f"give {scene}, which has one"

@@ -23,6 +23,7 @@ from lapgs_plugin.scenes import load_cameras, load_scene
 from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
+from lapgs_plugin.scenes.scene import require_colmap_or_transforms
 from tests.export_writers import WRITERS, Capture, from_colmap, synthetic, write_ply
 from tests.plugin_package import install_package
 from tests.refusals import refuses
@@ -180,7 +181,7 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("polycam", POLYCAM, '"fx": 170.0, ', "", "fx is None, expected a finite number"),
         ("polycam", POLYCAM, '"width": 192', '"width": 19.5', "width is 19.5, expected a whole number of pixels"),
         ("arkitscenes", TRAJ, "^[^ ]* ", "", "line 1 is .*expected 7 finite numbers"),
-        ("arkitscenes", TRAJ, "^.*$", "", "no poses in it"),
+        ("arkitscenes", TRAJ, "^.*$", "", "of 0 photos|none has a pose within"),
     ],
 )  # fmt: skip
 def test_damaged_exports_are_refused(name: str, file: str, pattern: str, by: str, facts: str, tmp_path: Path) -> None:
@@ -257,11 +258,14 @@ def test_cameras_and_photos_may_be_in_different_folders(tmp_path: Path) -> None:
     photos.parent.mkdir(parents=True)
     (tmp_path / "in/images").rename(photos)
     settings = PrepareSettings(model=tmp_path / "in")
-    refuses(SceneError, "no such image, nor any other", prepare_scene, tmp_path / "photos", tmp_path / "out", settings)
-    (tmp_path / "photos/images").mkdir()
-    photos.parent.rename(tmp_path / "photos/images/card")  # folders of memory cards below images/
+    (tmp_path / "photos/depth").mkdir()
+    (tmp_path / "photos/depth/shot 0 a.png").write_bytes((photos / "shot 0 a.png").read_bytes())  # no photo
     result = prepare_scene(tmp_path / "photos", tmp_path / "out", settings, progress=False)
     assert len(result.registered) == 6
+    (tmp_path / "photos/again").mkdir()
+    (tmp_path / "photos/again/shot 1 a.png").write_bytes((photos / "shot 1 a.png").read_bytes())
+    again = prepare_scene(tmp_path / "photos", tmp_path / "again", settings, progress=False)
+    assert again.left_out == ("shot 1 a",), "two photos of this name"
     refuses(
         UserInputError,
         "no model of COLMAP in it.*or with another program's export",
@@ -270,6 +274,18 @@ def test_cameras_and_photos_may_be_in_different_folders(tmp_path: Path) -> None:
         tmp_path / "other",
         PrepareSettings(model=tmp_path / "photos"),
     )
+
+
+def test_advice_about_the_folder_around_an_export(tmp_path: Path) -> None:
+    WRITERS["polycam"](tmp_path / "capture", synthetic())
+    refuses(SceneError, f"give {tmp_path}/capture, which has one", load_cameras, tmp_path)
+
+
+def test_checkouts_do_not_read_exports(tmp_path: Path) -> None:
+    WRITERS["opensfm"](tmp_path / "in", synthetic())
+    facts = "in/opensfm/reconstruction.json: checkouts do not .*lapgs prepare .*in OUT"
+    refuses(SceneError, facts, require_colmap_or_transforms, tmp_path / "in")
+    require_colmap_or_transforms(tmp_path)  # the checkout's own error is better
 
 
 def test_cameras_without_a_pose_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -303,7 +319,7 @@ def test_coordinates_of_the_earth_are_used_only_with_points_in_them(
     expected = capture.centers[0] + place if points == "of the earth" else (capture.centers[0] - shift) @ turn / scale
     np.testing.assert_allclose(center, expected, rtol=0, atol=1e-6)
     assert (len(source.points) == len(capture.xyz)) is (points in ("of the earth", "of the chunk"))
-    assert any("see few of the points" in line for line in source.warnings) is (points == "elsewhere")
+    assert any("see few of its points" in line for line in source.warnings) is (points == "elsewhere")
 
 
 @pytest.mark.parametrize("name", ["record3d", "polycam", "arkitscenes"])

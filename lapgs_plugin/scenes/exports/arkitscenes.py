@@ -51,39 +51,35 @@ class ARKitScenes(SceneReader):
 
     def read(self, source: Path, photos: PhotoFinder) -> Export:
         """Read the lens and the nearest pose of each photo of the largest size."""
-        folder = next(
-            (source.parent / name for name in PHOTOS if is_folder(source.parent / f"{name}_intrinsics")), None
-        )
-        files = [file for file in sorted(folder.glob("*")) if is_photo(file)] if folder and is_folder(folder) else []
-        if folder is None or not files:
+        text = read_text(source, error=SceneError, advice=EXPORT_AGAIN, written=True)
+        lines = [(index, line) for index, line in enumerate(text.splitlines(), 1) if line.strip()]
+        path = np.array([numbers(line, 7, f"{source} line {index}") for index, line in lines]).reshape(-1, 7)
+        choices = [(folder, *_posed(folder, path)) for name in PHOTOS if is_folder(folder := source.parent / name)]
+        folder, posed, total = max(choices, key=lambda choice: len(choice[1]), default=(source.parent, {}, 0))
+        if not posed:
             raise SceneError(
-                f"{source.parent}: no photos with lenses beside {TRAJECTORY}, expected {PHOTOS[0]} or {PHOTOS[2]}, and "
-                f"{PHOTOS[2]}_intrinsics or alike; download these, too"
+                f"{source}: of {total} photos in {folder} none has a pose within {APART:g} s, expected photos in "
+                f"{' or '.join(PHOTOS)}; download them again"
             )
-        lines = read_text(source, error=SceneError, advice=EXPORT_AGAIN, written=True).splitlines()
-        rows = [numbers(line, 7, f"{source} line {index}") for index, line in enumerate(lines, 1) if line.strip()]
         lenses = {_time(file): file for file in folder.with_name(f"{folder.name}_intrinsics").glob("*.pincam")}
-        if not rows or not lenses:
-            raise SceneError(f"{source}: no poses in it, or no .pincam files for {folder.name}; download them again")
-        path, shots, maps = np.stack(rows), [], {}
-        for file in files:
-            time = _time(file)
-            pose = path[np.abs(path[:, 0] - time).argmin()]
-            if abs(pose[0] - time) > APART:
-                continue
-            nearest = min(lenses, key=lambda other: abs(other - time))
-            if abs(nearest - time) > ROUNDED:
-                raise SceneError(f"{file}: no .pincam file of its lens; download it again")
+        shots, maps = [], {}
+        for file, pose in posed.items():
+            nearest = min(lenses, key=lambda time: abs(time - _time(file)), default=np.inf)
+            if abs(nearest - _time(file)) > ROUNDED:
+                raise SceneError(f"{file}: no .pincam file of its lens in {folder.name}_intrinsics; download it again")
             shots.append(_shot(file, lenses[nearest], pose, f"{source}: time {pose[0]:.3f}"))
             known = (source.parent / name / f"{file.stem}.png" for name in DEPTHS)
             if (depth := next(filter(is_file, known), None)) is not None:
                 maps[file] = depth
-        if not shots:
-            raise SceneError(f"{source}: no pose within {APART:g} s of any photo in {folder}; download them again")
         cloud = points_beside(source, source.parent.parent) or depth_points(shots, maps, MILLIMETRES)
-        return Export(
-            source, tuple(shots), cloud, skipped(source, {"without a pose": len(files) - len(shots)}, len(files))
-        )
+        return Export(source, tuple(shots), cloud, skipped(source, {"without a pose": total - len(shots)}, total))
+
+
+def _posed(folder: Path, path: Array) -> tuple[dict[Path, Array], int]:
+    """Return the photos of a folder that have a row of the path (n, 7) in time, and how many photos there are."""
+    files = [file for file in sorted(folder.iterdir()) if is_photo(file)]
+    rows = {file: path[np.abs(path[:, 0] - _time(file)).argmin()] for file in files} if len(path) else {}
+    return {file: row for file, row in rows.items() if abs(row[0] - _time(file)) <= APART}, len(files)
 
 
 def _time(file: Path) -> float:

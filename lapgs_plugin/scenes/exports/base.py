@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 PHOTO_FOLDERS = ("images", "input", ".")
 """Where the photos of an export are looked for."""
+NO_PHOTOS = ("masks", "depth", "normals")
+"""Folders of images that are named as photos are."""
 HEAD_CHARACTERS = 4096
 """Beginning of a file by which it is recognised."""
 NOT_RIGID = 1e-3
@@ -112,6 +114,7 @@ class PhotoFinder:
 
     def __init__(self, root: Path, images: str = PHOTO_FOLDERS[0]) -> None:
         folders = PHOTO_FOLDERS if images == PHOTO_FOLDERS[0] else (images,)
+        self._root = root
         self._folders = [root / folder for folder in folders if is_folder(root / folder)] or [root]
 
     def __call__(self, name: str) -> Path:
@@ -126,7 +129,8 @@ class PhotoFinder:
             for place in (folder.joinpath(*parts), folder / written.name):
                 if is_file(file := self._spelled(place)):
                     return file
-        below = self._below.get(self._stem(written.name), [])
+        named = (self._stem(written.name), self._stem(written.stem))  # raw photos are exported as JPEG
+        below = next((files for name in named if (files := self._below.get(name))), [])
         return below[0] if len(below) == 1 else self._folders[0].joinpath(*parts)
 
     def _spelled(self, place: Path) -> Path:
@@ -134,12 +138,11 @@ class PhotoFinder:
 
     @cached_property
     def _below(self) -> Mapping[str, list[Path]]:
-        """Photos in folders of the folder of photos, such as those of a memory card, by their names without suffix."""
+        """Photos in other folders, such as those of a memory card, by their names without suffix."""
         files: dict[str, list[Path]] = {}
-        for folder in self._folders:
-            for file in sorted(folder.rglob("*")) if folder.name in PHOTO_FOLDERS[:2] else ():
-                if has_photo_suffix(file) and is_file(file):
-                    files.setdefault(self._stem(file.name), []).append(file)
+        for file in sorted(self._root.rglob("*")):
+            if has_photo_suffix(file) and is_file(file) and file.relative_to(self._root).parts[0] not in NO_PHOTOS:
+                files.setdefault(self._stem(file.name), []).append(file)
         return files
 
     @staticmethod
@@ -196,6 +199,11 @@ def image_side(value: Any, where: str) -> int:
     if side < 1 or side != int(side):
         raise SceneError(f"{where} is {side:g}, expected a whole number of pixels; {EXPORT_AGAIN}")
     return int(side)
+
+
+def size_of(values: Mapping[str, Any], where: str) -> tuple[int, int]:
+    """Return the width and height of a table; errors as of `image_side`."""
+    return image_side(values.get("width"), f"{where}: width"), image_side(values.get("height"), f"{where}: height")
 
 
 def from_world(turn: Array, position: Array, where: str) -> Array:

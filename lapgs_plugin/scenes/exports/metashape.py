@@ -6,7 +6,6 @@ The lens models are those of appendix D of its user manual.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,16 +22,16 @@ from lapgs_plugin.scenes.exports.base import (
     SceneReader,
     Shot,
     from_world,
-    image_side,
     lens,
     number,
     numbers,
     only_file,
     perspective,
+    size_of,
     skipped,
     unknown_lens,
 )
-from lapgs_plugin.scenes.exports.points import points_beside, seen_share
+from lapgs_plugin.scenes.exports.points import SEEN, points_beside, seen_share
 from lapgs_plugin.untrusted import read_xml, shortened
 
 if TYPE_CHECKING:
@@ -43,8 +42,6 @@ if TYPE_CHECKING:
 LENSES = ("frame", "fisheye")
 FAR = 1e4
 """Distance from the origin, in extents of the cameras, of coordinates of the earth."""
-SEEN = 0.1
-"""Share of the points that cameras see at least if they are in the same coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +100,6 @@ class Metashape(SceneReader):
             where, known = _named(source, camera), lenses[camera.get("sensor_id", "")]
             assert known is not None  # or it was left out
             shots.append(Shot(photos(camera.get("label", "")), known, world.placed(poses[id(camera)], where)))
-        if cloud is not None and seen_share(cloud.xyz, shots) < SEEN:
-            warnings += (
-                f"{source}: the cameras see few of the points beside it, which are not used; export both in the "
-                "same coordinate system",
-            )
-            cloud = None
         reasons = {
             "disabled": len(cameras) - len(enabled),
             "not aligned": len(enabled) - len(aligned),
@@ -179,8 +170,7 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
         return None
     where = f"{source}: sensor {shortened(sensor.get('label', ''))}"
     resolution = calibration.find("resolution")
-    sides: Mapping[str, str] = {} if resolution is None else resolution.attrib
-    width, height = (image_side(sides.get(side), f"{where}: its {side}") for side in ("width", "height"))
+    width, height = size_of({} if resolution is None else resolution.attrib, where)
     kind = calibration.get("type", "frame")
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)

@@ -23,11 +23,11 @@ from lapgs_plugin.scenes.exports.base import (
     Shot,
     angle_axis,
     from_world,
-    image_side,
     lens,
     number,
     numbers,
     perspective,
+    size_of,
     skipped,
     unknown_lens,
 )
@@ -143,7 +143,7 @@ def _lens_of(where: str, name: Any, lenses: Mapping[str, pycolmap.Camera]) -> py
 def _lens(where: str, camera: Any) -> pycolmap.Camera:
     values = camera if isinstance(camera, dict) else {}
     kind = values.get("projection_type")
-    width, height = (image_side(values.get(side), f"{where}: {side}") for side in ("width", "height"))
+    width, height = size_of(values, where)
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)
 

@@ -16,6 +16,8 @@ from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
 
 TRIED_POINTS, TRIED_SHOTS = 2_000, 50
 """Most points, and about how many cameras, that are compared."""
+SEEN = 0.1
+"""Share of points that cameras see at least if both are in the same coordinates."""
 DEPTH_SHOTS = 40
 """Most depth maps that points are made of."""
 DEPTH_POINTS = 2_500

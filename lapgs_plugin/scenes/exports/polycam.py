@@ -16,9 +16,9 @@ from lapgs_plugin.scenes.exports.base import (
     SceneReader,
     Shot,
     from_world,
-    image_side,
     number,
     perspective,
+    size_of,
 )
 from lapgs_plugin.scenes.exports.points import MILLIMETRES, depth_points
 from lapgs_plugin.scenes.images import find_image
@@ -47,12 +47,8 @@ class Polycam(SceneReader):
             values = read_json(file, error=SceneError, advice=EXPORT_AGAIN)
             if not isinstance(values, dict):
                 raise SceneError(f"{file}: it holds {shortened(values)}, expected a camera; {EXPORT_AGAIN}")
-            terms = {key: number(values.get(key), f"{file}: {key}") for key in ("fx", "fy", "cx", "cy")}
-            size = (
-                image_side(values.get("width"), f"{file}: width"),
-                image_side(values.get("height"), f"{file}: height"),
-            )
-            camera = perspective(size, (terms["fx"], terms["fy"]), (terms["cx"], terms["cy"]), where=str(file))
+            fx, fy, cx, cy = (number(values.get(key), f"{file}: {key}") for key in ("fx", "fy", "cx", "cy"))
+            camera = perspective(size_of(values, str(file)), (fx, fy), (cx, cy), where=str(file))
             entries = [
                 [number(values.get(key := f"t_{row}{column}"), f"{file}: {key}") for column in range(4)]
                 for row in range(3)

@@ -13,6 +13,7 @@ from lapgs_plugin.scenes.colmap import refuse_distorted, source_of
 from lapgs_plugin.scenes.colmap_model import Model, model_of
 from lapgs_plugin.scenes.colmap_records import Points
 from lapgs_plugin.scenes.exports.base import Export, PhotoFinder, SceneReader
+from lapgs_plugin.scenes.exports.points import SEEN, seen_share
 from lapgs_plugin.scenes.source import SceneSource, hold_out
 
 NO_POINTS = np.empty((0, 3))
@@ -65,10 +66,16 @@ def _model_of(export: Export, root: Path) -> Model:
         )
         for shot in export.shots
     ]
-    cloud = export.points
+    cloud, warnings = export.points, list(export.warnings)
+    if cloud and len(cloud.xyz) and seen_share(cloud.xyz, export.shots) < SEEN:
+        warnings.append(
+            f"{export.source}: its cameras see few of its points, which are not used; export both in the same "
+            "coordinate system"
+        )
+        cloud = None
+    warnings += [cloud.warning] if cloud and cloud.warning else []
     points = Points(NO_POINTS, NO_POINTS) if cloud is None else Points(cloud.xyz, 255.0 * cloud.rgb)
-    warnings = (*export.warnings, *([cloud.warning] if cloud and cloud.warning else []))
-    return replace(model_of(export.source, named, points), warnings=warnings)
+    return replace(model_of(export.source, named, points), warnings=tuple(warnings))
 
 
 def find_export(folder: Path) -> FoundExport | None:
