@@ -160,11 +160,12 @@ def write_realitycapture(folder: Path, capture: Capture) -> None:
     side = max(width, height)
     rows = [f"#cameras {len(capture.names)}", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
     for index, name in enumerate(capture.names):
-        towards_gl = Rotation.from_matrix(capture.turns[index].T) * Rotation.from_euler("x", 180, degrees=True)
-        heading, pitch, roll = towards_gl.as_euler("ZXY", degrees=True)
+        axes = capture.turns[index].T @ np.diag([1, -1, -1])  # Rz(-heading) Rx(pitch) Ry(roll), multiplied out
+        heading = np.degrees(np.arctan2(axes[0, 1], axes[1, 1]))
+        pitch, roll = np.degrees([np.arcsin(axes[2, 1]), np.arctan2(-axes[2, 0], axes[2, 2])])
         numbers = [
             *capture.centers[index],
-            *(-heading, pitch, roll, capture.focal[0] * 36 / side),
+            *(heading, pitch, roll, capture.focal[0] * 36 / side),
             (capture.center[0] - width / 2) / side,
             (capture.center[1] - height / 2) / side,
             *(*capture.radial, 0.0, *capture.tangential),
@@ -206,7 +207,7 @@ def write_opensfm(folder: Path, capture: Capture) -> None:
     }
     shots = {
         name: {
-            "rotation": Rotation.from_matrix(turn).as_rotvec().tolist(),
+            "rotation": cv2.Rodrigues(turn)[0].ravel().tolist(),
             "translation": shift.tolist(),
             "camera": "v2 a b",
             "orientation": 1,
@@ -226,14 +227,14 @@ def write_opensfm(folder: Path, capture: Capture) -> None:
 
 def _arkit_poses(capture: Capture) -> Array:
     """Return camera to world (v, 3, 4) of cameras that look along -z, y up."""
-    turns = Rotation.from_matrix(capture.turns.transpose(0, 2, 1)) * Rotation.from_euler("x", 180, degrees=True)
-    return np.concatenate([turns.as_matrix(), capture.centers[:, :, None]], 2)
+    turns = capture.turns.transpose(0, 2, 1) @ np.diag([1.0, -1.0, -1.0])
+    return np.concatenate([turns, capture.centers[:, :, None]], 2)
 
 
 def write_record3d(folder: Path, capture: Capture) -> None:
     """Write EXR + RGB: a quaternion x, y, z, w and a position for each frame."""
     (fx, fy), (cx, cy) = capture.focal, capture.center
-    poses = [[*Rotation.from_matrix(pose[:, :3]).as_quat(), *pose[:, 3]] for pose in _arkit_poses(capture)]
+    poses = [[*pycolmap.Rotation3d(pose[:, :3]).quat, *pose[:, 3]] for pose in _arkit_poses(capture)]
     metadata = {
         **{"w": capture.size[0], "h": capture.size[1], "dw": 48, "dh": 32, "fps": 60},
         "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1],
@@ -265,7 +266,7 @@ def write_arkitscenes(folder: Path, capture: Capture) -> None:
     rows, names = [], ["41069021_99.000.png"]
     for index, (turn, shift) in enumerate(zip(capture.turns, capture.shifts, strict=True)):
         time = 100.1 + index
-        values = [time + 0.002, *Rotation.from_matrix(turn).as_rotvec(), *shift]
+        values = [time + 0.002, *cv2.Rodrigues(turn)[0].ravel(), *shift]
         rows.append(" ".join(repr(float(value)) for value in values))
         names.append(f"41069021_{time:.3f}.png")
         pincam = frames / f"lowres_wide_intrinsics/41069021_{time - 0.001:.3f}.pincam"

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import is_file, is_folder
@@ -18,11 +19,10 @@ from lapgs_plugin.scenes.exports.base import (
     PhotoFinder,
     SceneReader,
     Shot,
-    angle_axis,
     from_world,
-    image_side,
     numbers,
     perspective,
+    size_of,
     skipped,
 )
 from lapgs_plugin.scenes.exports.points import MILLIMETRES, depth_points, points_beside
@@ -92,7 +92,7 @@ def _time(file: Path) -> float:
 
 def _shot(photo: Path, pincam: Path, pose: Array, where: str) -> Shot:
     values = numbers(read_text(pincam, error=SceneError, advice=EXPORT_AGAIN), 6, str(pincam))
-    size = (image_side(values[0], f"{pincam}: its width"), image_side(values[1], f"{pincam}: its height"))
+    size = size_of(values[0], values[1], str(pincam))
     camera = perspective(size, (values[2], values[3]), (values[4], values[5]), where=str(pincam))
-    rotation = angle_axis(pose[1:4])  # world to camera, of axes as COLMAP's
+    rotation = Rotation.from_rotvec(pose[1:4]).as_matrix()  # world to camera, of axes as COLMAP's
     return Shot(photo, camera, from_world(rotation.T, -rotation.T @ pose[4:], where))

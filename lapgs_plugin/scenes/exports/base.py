@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -193,17 +192,12 @@ def number(value: Any, where: str) -> float:
     return float(numbers(value if isinstance(value, str | list | dict | None) else [value], 1, where)[0])
 
 
-def image_side(value: Any, where: str) -> int:
-    """Return a width or height in pixels as a whole number; errors as of `numbers`."""
-    side = number(value, where)
-    if side < 1 or side != int(side):
-        raise SceneError(f"{where} is {side:g}, expected a whole number of pixels; {EXPORT_AGAIN}")
-    return int(side)
-
-
-def size_of(values: Mapping[str, Any], where: str) -> tuple[int, int]:
-    """Return the width and height of a table; errors as of `image_side`."""
-    return image_side(values.get("width"), f"{where}: width"), image_side(values.get("height"), f"{where}: height")
+def size_of(width: Any, height: Any, where: str) -> tuple[int, int]:
+    """Return a width and a height in pixels, which have to be whole numbers; errors as of `numbers`."""
+    sides = number(width, f"{where}: width"), number(height, f"{where}: height")
+    if min(sides) < 1 or any(side % 1 for side in sides):
+        raise SceneError(f"{where}: {sides[0]:g}x{sides[1]:g}, expected whole numbers of pixels; {EXPORT_AGAIN}")
+    return int(sides[0]), int(sides[1])
 
 
 def from_world(turn: Array, position: Array, where: str) -> Array:
@@ -294,11 +288,3 @@ def sizes_of(source: Path, photos: Sequence[Path]) -> dict[Path, tuple[int, int]
         )
     first = next(iter(known.values()))
     return {photo: known.get(photo, first) for photo in photos}
-
-
-def angle_axis(vector: Array) -> Array:
-    """Return the rotation matrix (3, 3) of an axis times an angle in radians, (3,)."""
-    angle = math.hypot(*vector)
-    half, axis = angle / 2.0, vector / angle if angle else vector
-    result: Array = pycolmap.Rotation3d(np.array([*math.sin(half) * axis, math.cos(half)])).matrix()
-    return result

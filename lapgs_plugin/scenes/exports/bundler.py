@@ -16,6 +16,7 @@ from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes.exports.base import (
     EXPORT_AGAIN,
     OPENGL,
+    Array,
     Export,
     PhotoFinder,
     SceneReader,
@@ -57,34 +58,23 @@ class Bundler(SceneReader):
             )
         names = _names(source)
         if len(names) != cameras:
-            raise SceneError(
-                f"{source}: {cameras} cameras and {len(names)} names of photos, expected as many; {EXPORT_AGAIN}"
-            )
-        starts = range(1, last, LINES_A_CAMERA)
-        values = [
-            numbers(" ".join(lines[start : start + LINES_A_CAMERA]), 15, f"{source}: camera {number}")
-            for number, start in enumerate(starts)
-        ]
-        placed = {name: camera for name, camera in zip(names, values, strict=True) if camera[0]}
+            raise SceneError(f"{source}: {len(names)} photos in its list, expected {cameras}; {EXPORT_AGAIN}")
+        parts = [" ".join(lines[start : start + LINES_A_CAMERA]) for start in range(1, last, LINES_A_CAMERA)]
+        values = [numbers(part, 15, f"{source}: camera {index}") for index, part in enumerate(parts)]
+        placed = [(photos(name), camera) for name, camera in zip(names, values, strict=True) if camera[0]]
         if not placed:
-            raise SceneError(
-                f"{source}: none of its {cameras} cameras has a pose; align the photos and export them again"
-            )
-        files = [photos(name) for name, camera in zip(names, values, strict=True) if camera[0]]
-        sizes, shots = sizes_of(source, files), []
-        for file, camera in zip(files, (camera for camera in values if camera[0]), strict=True):
-            (width, height), turn = sizes[file], camera[3:12].reshape(3, 3)
-            known = perspective(
-                (width, height),
-                (camera[0],) * 2,
-                (width / 2.0, height / 2.0),
-                camera[1:3].tolist(),
-                where=f"{source}: {file.name}",
-            )
-            pose = from_world(turn.T @ OPENGL, -turn.T @ camera[12:], f"{source}: {file.name}")
-            shots.append(Shot(file, known, pose))
+            raise SceneError(f"{source}: none of its {cameras} cameras has a pose; align the photos and {EXPORT_AGAIN}")
+        sizes = sizes_of(source, [file for file, _ in placed])
+        shots = tuple(_shot(f"{source}: {file.name}", file, sizes[file], camera) for file, camera in placed)
         warnings = skipped(source, {"not placed": cameras - len(shots)}, cameras)
-        return Export(source, tuple(shots), _points(source, lines[last:], points), warnings)
+        return Export(source, shots, _points(source, lines[last:], points), warnings)
+
+
+def _shot(where: str, file: Path, size: tuple[int, int], values: Array) -> Shot:
+    """Return a photo of a camera's 15 numbers: f, k1, k2, a rotation and a translation from the world."""
+    turn, center = values[3:12].reshape(3, 3), (size[0] / 2.0, size[1] / 2.0)
+    known = perspective(size, (values[0], values[0]), center, values[1:3].tolist(), where=where)
+    return Shot(file, known, from_world(turn.T @ OPENGL, -turn.T @ values[12:], where))
 
 
 def _names(source: Path) -> list[str]:

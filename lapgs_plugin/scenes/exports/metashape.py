@@ -45,6 +45,15 @@ FAR = 1e4
 
 
 @dataclass(frozen=True, eq=False)
+class _Placed:
+    """A photo with its lens and its pose in a chunk, camera to chunk."""
+
+    photo: Path
+    camera: pycolmap.Camera
+    pose: Array  # (4, 4)
+
+
+@dataclass(frozen=True, eq=False)
 class _World:
     """A similarity transform from a chunk to its world."""
 
@@ -52,9 +61,14 @@ class _World:
     shift: Array  # (3,)
     scale: float
 
-    def placed(self, pose: Array, where: str) -> Array:
-        """Return world to camera of a camera's pose in the chunk (4, 4), camera to chunk."""
-        return from_world(self.turn @ pose[:3, :3], self.scale * self.turn @ pose[:3, 3] + self.shift, where)
+    def center(self, placed: _Placed) -> Array:
+        """Return the position of a camera in the world, (3,)."""
+        return self.scale * self.turn @ placed.pose[:3, 3] + self.shift
+
+    def shot(self, placed: _Placed) -> Shot:
+        """Return a photo in the world."""
+        pose = from_world(self.turn @ placed.pose[:3, :3], self.center(placed), str(placed.photo))
+        return Shot(placed.photo, placed.camera, pose)
 
 
 CHUNK = _World(np.eye(3), np.zeros(3), 1.0)
@@ -73,39 +87,30 @@ class Metashape(SceneReader):
         """Read the aligned, enabled cameras of the chunk's largest component."""
         chunk = _only_chunk(source)
         cameras = chunk.findall("cameras//camera")
-        if not cameras:
-            raise SceneError(
-                f"{source}: the chunk {shortened(chunk.get('label', ''))} has no cameras, expected aligned photos; "
-                "align them and export the cameras again"
-            )
         lenses = {sensor.get("id", ""): _lens(sensor, source) for sensor in chunk.findall("sensors/sensor")}
         enabled = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
         aligned = [
-            camera
+            (camera, known)
             for camera in enabled
-            if camera.find("transform") is not None and lenses.get(camera.get("sensor_id", "")) is not None
+            if camera.find("transform") is not None and (known := lenses.get(camera.get("sensor_id", ""))) is not None
         ]
         if not aligned:
+            problem = f"none of its {len(cameras)} cameras is aligned and enabled" if cameras else "has no cameras"
             raise SceneError(
-                f"{source}: none of its {len(cameras)} cameras is aligned and enabled; align the photos and export the "
-                "cameras again"
+                f"{source}: the chunk {shortened(chunk.get('label', ''))}: {problem}, expected aligned photos; align "
+                "them and export the cameras again"
             )
-        component, count = Counter(camera.get("component_id") for camera in aligned).most_common(1)[0]
-        used = [camera for camera in aligned if camera.get("component_id") == component]
-        poses = {id(camera): _pose(camera, source) for camera in used}
+        component = Counter(camera.get("component_id") for camera, _ in aligned).most_common(1)[0][0]
+        used = [(camera, known) for camera, known in aligned if camera.get("component_id") == component]
+        placed = [_Placed(photos(camera.get("label", "")), known, _pose(camera, source)) for camera, known in used]
         cloud = points_beside(source)
-        world, warnings = _fitting_world(source, _world(chunk, component, source), list(poses.values()), cloud)
-        shots = []
-        for camera in used:
-            where, known = _named(source, camera), lenses[camera.get("sensor_id", "")]
-            assert known is not None  # or it was left out
-            shots.append(Shot(photos(camera.get("label", "")), known, world.placed(poses[id(camera)], where)))
+        shots, warnings = _in_fitting_world(source, _world(chunk, component, source), placed, cloud)
         reasons = {
             "disabled": len(cameras) - len(enabled),
             "not aligned": len(enabled) - len(aligned),
-            "in smaller components": len(aligned) - count,
+            "in smaller components": len(aligned) - len(used),
         }
-        return Export(source, tuple(shots), cloud, (*warnings, *skipped(source, reasons, len(cameras))))
+        return Export(source, shots, cloud, (*warnings, *skipped(source, reasons, len(cameras))))
 
 
 def _only_chunk(source: Path) -> Element:
@@ -120,13 +125,9 @@ def _only_chunk(source: Path) -> Element:
     return chunks[0]
 
 
-def _named(source: Path, camera: Element) -> str:
-    return f"{source}: camera {shortened(camera.get('label', ''))}"
-
-
 def _pose(camera: Element, source: Path) -> Array:
     """Return a camera's pose (4, 4), camera to chunk, in COLMAP's axes."""
-    where = f"the transform of {_named(source, camera)}"
+    where = f"{source}: the transform of camera {shortened(camera.get('label', ''))}"
     return numbers(camera.findtext("transform"), 16, where).reshape(4, 4)
 
 
@@ -146,20 +147,18 @@ def _world(chunk: Element, component: str | None, source: Path) -> _World:
     )
 
 
-def _fitting_world(
-    source: Path, world: _World, poses: list[Array], cloud: PointCloud | None
-) -> tuple[_World, tuple[str, ...]]:
-    """Return the coordinates to train in: the chunk's own where its world is the earth, unless points are in that."""
-    centers = np.stack([pose[:3, 3] for pose in poses])
-    extent = world.scale * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if np.linalg.norm(world.scale * world.turn @ centers.mean(axis=0) + world.shift) <= FAR * extent:
-        return world, ()
-    if cloud is not None:
-        camera = lens("SIMPLE_PINHOLE", (2, 2), [1.0, 1.0, 1.0])
-        placed = [Shot(source, camera, world.placed(pose, str(source))) for pose in poses]
-        if seen_share(cloud.xyz, placed) >= SEEN:
-            return world, ()
-    return CHUNK, (f"{source}: its world is the earth's; the chunk's own coordinates and units are used",)
+def _in_fitting_world(
+    source: Path, world: _World, placed: list[_Placed], cloud: PointCloud | None
+) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
+    """Return shots in the world, or in the chunk's own coordinates if its world is the earth and the points are not."""
+    shots = tuple(map(world.shot, placed))
+    centers = np.stack([world.center(one) for one in placed])
+    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    near = np.linalg.norm(centers.mean(axis=0)) <= FAR * extent
+    if near or (cloud is not None and seen_share(cloud.xyz, shots) >= SEEN):
+        return shots, ()
+    line = f"{source}: its world is the earth's; the chunk's own coordinates and units are used"
+    return tuple(map(CHUNK.shot, placed)), (line,)
 
 
 def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
@@ -170,7 +169,8 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
         return None
     where = f"{source}: sensor {shortened(sensor.get('label', ''))}"
     resolution = calibration.find("resolution")
-    width, height = size_of({} if resolution is None else resolution.attrib, where)
+    sides = {} if resolution is None else resolution.attrib
+    width, height = size_of(sides.get("width"), sides.get("height"), where)
     kind = calibration.get("type", "frame")
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import is_file
@@ -21,7 +22,6 @@ from lapgs_plugin.scenes.exports.base import (
     PhotoFinder,
     SceneReader,
     Shot,
-    angle_axis,
     from_world,
     lens,
     number,
@@ -70,7 +70,7 @@ class OpenSfM(SceneReader):
             where = f"{source}: shot {shortened(name)}"
             values = shot if isinstance(shot, dict) else {}
             turn, shift = (numbers(values.get(key), 3, f"{where}: {key}") for key in ("rotation", "translation"))
-            rotation = angle_axis(turn)
+            rotation = Rotation.from_rotvec(turn).as_matrix()
             pose = from_world(rotation.T, -rotation.T @ shift, where)
             shots.append(Shot(photos(name), _lens_of(where, values.get("camera"), lenses), pose))
         if not shots:
@@ -119,7 +119,7 @@ def _from_geojson(source: Path, data: Any, photos: PhotoFinder) -> Export:
         turn, center = (numbers(values.get(key), 3, f"{where}: {key}") for key in ("rotation", "translation"))
         only = next(iter(lenses)) if len(lenses) == 1 else None
         known = _lens_of(where, values.get("camera", only), lenses)
-        poses.append((values["filename"], known, angle_axis(turn).T, center))
+        poses.append((values["filename"], known, Rotation.from_rotvec(turn).as_matrix().T, center))
     middle = np.mean([center for *_, center in poses], axis=0).round()
     shots = [
         Shot(photos(name), known, from_world(turn, center - middle, f"{source}: {shortened(name)}"))
@@ -143,7 +143,7 @@ def _lens_of(where: str, name: Any, lenses: Mapping[str, pycolmap.Camera]) -> py
 def _lens(where: str, camera: Any) -> pycolmap.Camera:
     values = camera if isinstance(camera, dict) else {}
     kind = values.get("projection_type")
-    width, height = size_of(values, where)
+    width, height = size_of(values.get("width"), values.get("height"), where)
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)
 

@@ -48,7 +48,9 @@ class Polycam(SceneReader):
             if not isinstance(values, dict):
                 raise SceneError(f"{file}: it holds {shortened(values)}, expected a camera; {EXPORT_AGAIN}")
             fx, fy, cx, cy = (number(values.get(key), f"{file}: {key}") for key in ("fx", "fy", "cx", "cy"))
-            camera = perspective(size_of(values, str(file)), (fx, fy), (cx, cy), where=str(file))
+            camera = perspective(
+                size_of(values.get("width"), values.get("height"), str(file)), (fx, fy), (cx, cy), where=str(file)
+            )
             entries = [
                 [number(values.get(key := f"t_{row}{column}"), f"{file}: {key}") for column in range(4)]
                 for row in range(3)

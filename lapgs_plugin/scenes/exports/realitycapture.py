@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.exports.base import (
     EXPORT_AGAIN,
     OPENGL,
-    Array,
     Export,
     PhotoFinder,
     SceneReader,
@@ -27,6 +28,8 @@ from lapgs_plugin.untrusted import read_text, shortened
 
 NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 """Columns without which a CSV is another one."""
+OTHERS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+"""Columns that are 0 where they are missing. A user chooses the columns."""
 FILM = 36.0
 """Width of 35 mm film in mm, of which focal lengths are given."""
 
@@ -42,45 +45,14 @@ class RealityCapture(SceneReader):
 
     def read(self, source: Path, photos: PhotoFinder) -> Export:
         """Read a camera of each row."""
-        text = read_text(source, error=SceneError, advice=EXPORT_AGAIN, written=True)
-        columns, lines = _columns(text), text.splitlines()
-        first = next(number for number, line in enumerate(lines, 1) if line.split(",")[0].lower() == "#name")
-        rows = [(line, row) for line, row in enumerate(csv.reader(lines[first:]), first + 1) if any(row)]
-        for line, row in rows:
-            if len(row) != len(columns):
-                raise SceneError(
-                    f"{source} line {line}: {len(row)} values ({shortened(','.join(row))}), expected the "
-                    f"{len(columns)} that its first line names; {EXPORT_AGAIN}"
-                )
-        if not rows:
-            raise SceneError(f"{source}: no cameras in it; align the photos and export them again")
-        files = [photos(row[columns.index("name")]) for _, row in rows]
+        rows = _rows(source)
+        files = [photos(row["name"]) for row in rows.values()]
         sizes = sizes_of(source, files)
-        shots = []
-        for (line, row), file in zip(rows, files, strict=True):
-            where = f"{source} line {line}"
-            values = {
-                name: number(text, f"{where}: {name}") for name, text in zip(columns, row, strict=True) if name in KNOWN
-            }
-            width, height = sizes[file]
-            side, zero = max(width, height), dict.fromkeys(KNOWN, 0.0)
-            values = {**zero, **values}
-            camera = perspective(
-                (width, height),
-                (values["f"] * side / FILM,) * 2,
-                (width / 2.0 + values["px"] * side, height / 2.0 + values["py"] * side),
-                [values[f"k{power}"] for power in range(1, 5)],
-                (values["t1"], values["t2"]),
-                where=where,
-            )
-            position = np.array([values["x"], values["y"], values["alt"]])
-            turn = _turn(*(values[name] for name in ("heading", "pitch", "roll")))
-            shots.append(Shot(file, camera, from_world(turn @ OPENGL, position, where)))
+        shots = [
+            _shot(f"{source} line {line}", file, sizes[file], row)
+            for (line, row), file in zip(rows.items(), files, strict=True)
+        ]
         return Export(source, tuple(shots), points_beside(source))
-
-
-KNOWN = (*NEEDED[1:], "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-"""Columns of numbers that are read."""
 
 
 def _columns(text: str) -> list[str]:
@@ -91,11 +63,37 @@ def _columns(text: str) -> list[str]:
     return []
 
 
-def _turn(heading: float, pitch: float, roll: float) -> Array:
-    """Return the rotation (3, 3) from a camera of OpenGL's axes to the world, of angles in degrees."""
-    (sh, sp, sr), (ch, cp, cr) = np.sin(angles := np.radians([-heading, pitch, roll])), np.cos(angles)
-    about_z = np.array([[ch, -sh, 0.0], [sh, ch, 0.0], [0.0, 0.0, 1.0]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]])
-    about_y = np.array([[cr, 0.0, sr], [0.0, 1.0, 0.0], [-sr, 0.0, cr]])
-    turn: Array = about_z @ about_x @ about_y
-    return turn
+def _rows(source: Path) -> dict[int, dict[str, str]]:
+    """Return the values of each camera by column, by the number of its line."""
+    text = read_text(source, error=SceneError, advice=EXPORT_AGAIN, written=True)
+    columns, lines, rows = _columns(text), text.splitlines(), dict[int, dict[str, str]]()
+    for line, row in enumerate(csv.reader(lines), 1):
+        if not row or row[0].startswith("#"):
+            continue
+        if len(row) != len(columns):
+            raise SceneError(
+                f"{source} line {line}: {len(row)} values ({shortened(','.join(row))}), expected the {len(columns)} "
+                f"that its first line names; {EXPORT_AGAIN}"
+            )
+        rows[line] = dict(zip(columns, row, strict=True))
+    if not rows:
+        raise SceneError(f"{source}: no cameras in it; align the photos and export them again")
+    return rows
+
+
+def _shot(where: str, file: Path, size: tuple[int, int], row: Mapping[str, str]) -> Shot:
+    values = {name: number(row.get(name, "0"), f"{where}: {name}") for name in (*NEEDED[1:], *OTHERS)}
+    width, height = size
+    side = max(size)
+    camera = perspective(
+        size,
+        (values["f"] * side / FILM,) * 2,
+        (width / 2.0 + values["px"] * side, height / 2.0 + values["py"] * side),
+        [values[f"k{power}"] for power in range(1, 5)],
+        (values["t1"], values["t2"]),
+        where=where,
+    )
+    angles = (-values["heading"], values["pitch"], values["roll"])
+    turn = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()  # of a camera of OpenGL's axes
+    position = np.array([values["x"], values["y"], values["alt"]])
+    return Shot(file, camera, from_world(turn @ OPENGL, position, where))

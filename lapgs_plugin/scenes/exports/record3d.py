@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import is_file, is_folder
@@ -18,9 +19,9 @@ from lapgs_plugin.scenes.exports.base import (
     SceneReader,
     Shot,
     from_world,
-    image_side,
     numbers,
     perspective,
+    size_of,
     skipped,
 )
 from lapgs_plugin.scenes.exports.points import MILLIMETRES, depth_points
@@ -59,7 +60,7 @@ class Record3D(SceneReader):
             pose = numbers(poses[index], 7, where)  # a quaternion x, y, z, w, and the position
             if abs(np.linalg.norm(pose[:4]) - 1.0) > 1e-2:
                 raise SceneError(f"{where} begins with no quaternion of length 1; {EXPORT_AGAIN}")
-            turn = pycolmap.Rotation3d(pose[:4] / np.linalg.norm(pose[:4])).matrix()
+            turn = Rotation.from_quat(pose[:4]).as_matrix()
             shots.append(Shot(file, _lens(source, values, index), from_world(turn @ OPENGL, pose[4:], where)))
             known = (source.parent / DEPTH / f"{file.stem}{suffix}" for suffix in (".exr", ".png"))
             if (depth := next(filter(is_file, known), None)) is not None:
@@ -70,7 +71,7 @@ class Record3D(SceneReader):
 
 def _lens(source: Path, values: dict[str, Any], index: int) -> pycolmap.Camera:
     """Return the lens of a photo, else that of all."""
-    size = (image_side(values.get("w"), f"{source}: w"), image_side(values.get("h"), f"{source}: h"))
+    size = size_of(values.get("w"), values.get("h"), str(source))
     each = values.get("perFrameIntrinsicCoeffs")
     if isinstance(each, list) and index < len(each):
         fx, fy, cx, cy = numbers(each[index], 4, f"{source}: intrinsics {index}")
