@@ -131,6 +131,20 @@ def test_lenses_of_metashape_are_those_of_its_manual(kind: str, tmp_path: Path) 
     )
 
 
+def test_a_fourth_radial_term_is_expressed_to_a_tenth_of_a_pixel(tmp_path: Path) -> None:
+    WRITERS["metashape"](tmp_path, synthetic())
+    terms = {"f": 160.0, "cx": 0.0, "cy": 0.0, "b1": 0.0, "k1": -0.28, "k2": 0.11, "k3": -0.03, "k4": 0.005}
+    lens = "".join(f"<{key}>{value}</{key}>" for key, value in terms.items())
+    edit(tmp_path / "cameras.xml", r'class="adjusted">(<resolution [^>]*>).*?</cal', rf'class="adjusted">\1{lens}</cal')
+    found = find_export(tmp_path)
+    assert found is not None
+    model, _ = found.read(tmp_path)
+    xyz = np.random.default_rng(0).uniform((-0.65, -0.45, 1), (0.65, 0.45, 1), (200, 3))
+    pixels = project(terms | {"p1": 0.0, "p2": 0.0}, xyz, fisheye=False)
+    # Worst 3e-6 pixels.
+    np.testing.assert_allclose(model.cameras[1].img_from_cam(xyz), pixels, rtol=0, atol=1e-3)
+
+
 def edit(file: Path, pattern: str, by: str) -> None:
     """Replace text in a file."""
     text, count = re.subn(pattern, by, file.read_text(), count=1, flags=re.DOTALL)
@@ -153,8 +167,8 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("metashape", XML, "</chunk>.*", "", "not readable as XML"),
         ("metashape", XML, 'frame" class="adj', 'tube" class="adj', "lens model 'tube', expected frame, fisheye"),
         ("metashape", XML, 'frame" class="adj', 'spherical" class="adj', "lens model spherical: it sees all around"),
-        ("metashape", XML, "<f>170.0</f>", "<f>170</f><k4>0.1</k4>", "k4 = 0.1.*align again without k4"),
-        ("metashape", XML, "<f>170.0</f>", "<f>170</f><b2>0.1</b2>", "skew b2 = 0.1.*align again without b1 and b2"),
+        ("metashape", XML, "<f>170.0</f>", "<f>60</f><k1>-2</k1><k2>3</k2><k3>-3</k3><k4>2</k4>", "k4 = 2,.*align again"),
+        ("metashape", XML, "<f>170.0</f>", "<f>170</f><b2>1</b2>", "skew b2 = 1,.*align again without b1 and b2"),
         ("metashape", XML, "<f>170.0</f>", "<f>nan</f>", "'lens': its f is 'nan', expected a finite number"),
         ("metashape", XML, '0 a"><transform>[^<]*', '0 a"><transform>1 0 0', "'shot 0 a' is '1 0 0', expected 16"),
         ("metashape", XML, '0 a"><transform>[^ <]*', '0 a"><transform>nan', "'shot 0 a' is 'nan .*expected 16"),

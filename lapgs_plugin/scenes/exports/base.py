@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import SceneError, counted
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_records import file_name
+from lapgs_plugin.scenes.exports.fourth_term import rational_terms
 from lapgs_plugin.scenes.images import find_image, image_size, is_photo
 from lapgs_plugin.scenes.masks import has_photo_suffix
 from lapgs_plugin.scenes.point_cloud import PointCloud
@@ -35,6 +36,8 @@ NOT_RIGID = 1e-3
 """Largest error of a rotation matrix; files round to a few digits."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """From axes of OpenGL (x right, y up, z backwards) to those of COLMAP (x right, y down, z forward), and back."""
+INEXACT = 0.1
+"""Largest error in pixels of a lens that COLMAP has no model for."""
 ALL_AROUND_LENSES = ("spherical", "equirectangular")
 EXPORT_AGAIN = "export it again"
 
@@ -240,17 +243,20 @@ def perspective(
         where: begins a message.
 
     Raises:
-        SceneError: the radial polynomial has a fourth factor, which no lens of COLMAP has.
+        SceneError: the polynomial has a fourth factor and cannot be expressed by a lens of COLMAP.
     """
-    k1, k2, k3, k4 = (*radial, *(0.0,) * (4 - len(radial)))
-    if k4:
-        raise SceneError(
-            f"{where} has the distortion k4 = {k4:g}, which COLMAP's lenses lack; align again without k4 (Metashape: "
-            "Optimize Cameras; RealityCapture: Brown3), or export undistorted photos with their cameras"
-        )
     if not any((*radial, *tangential)):
         return lens("PINHOLE", size, [*focal, *center])
-    return lens("FULL_OPENCV", size, [*focal, *center, k1, k2, *tangential, k3, 0.0, 0.0, 0.0])
+    k1, k2, k3, *others = (*radial, *(0.0,) * (6 - len(radial)))
+    if others[0]:
+        terms, error = rational_terms((k1, k2, k3, others[0]), float(np.hypot(*size)) / (2.0 * min(focal)))
+        if not error * max(focal) <= INEXACT:
+            raise SceneError(
+                f"{where} has the distortion k4 = {others[0]:g}, which COLMAP's lenses cannot express within {INEXACT} "
+                "pixels; align again without k4, or export undistorted photos with their cameras"
+            )
+        k1, k2, k3, *others = terms.tolist()
+    return lens("FULL_OPENCV", size, [*focal, *center, k1, k2, *tangential, k3, *others])
 
 
 def lens(model: str, size: tuple[int, int], params: Sequence[float]) -> pycolmap.Camera:
