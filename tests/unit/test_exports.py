@@ -167,7 +167,7 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("metashape", XML, "</chunk>.*", "", "not readable as XML"),
         ("metashape", XML, 'frame" class="adj', 'tube" class="adj', "lens model 'tube', expected frame, fisheye"),
         ("metashape", XML, 'frame" class="adj', 'spherical" class="adj', "lens model spherical: it sees all around"),
-        ("metashape", XML, "<f>170.0</f>", "<f>60</f><k1>-2</k1><k2>3</k2><k3>-3</k3><k4>2</k4>", "k4 = 2,.*align again"),
+        ("metashape", XML, "<f>170.0</f>", "<f>60</f><k1>-2</k1><k2>3</k2><k3>-3</k3><k4>2</k4>", "k4 = 2,.*align"),
         ("metashape", XML, "<f>170.0</f>", "<f>170</f><b2>1</b2>", "skew b2 = 1,.*align again without b1 and b2"),
         ("metashape", XML, "<f>170.0</f>", "<f>nan</f>", "'lens': its f is 'nan', expected a finite number"),
         ("metashape", XML, '0 a"><transform>[^<]*', '0 a"><transform>1 0 0', "'shot 0 a' is '1 0 0', expected 16"),
