@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,12 +44,13 @@ class CheckoutScene:
             folder: receives the files that the Scene writes beside a model.
 
         Raises:
-            SceneError: the scene has no points.
+            SceneError: the scene has no points, or no file of them.
             UserInputError: the Scene initialised no model from points, or has cameras at several resolutions.
         """
         model = _PointRecorder()
         own = call.changed(dataset=with_values(call.dataset, {"model_path": str(folder)}))
-        with own.own_folder():
+        source_path = Path(call.dataset.source_path)
+        with own.own_folder(), _missing_points_told(source_path):
             scene = adapter.profile.make_scene(own.values, model)
         if not hasattr(model, "points"):
             raise UserInputError(
@@ -55,7 +58,7 @@ class CheckoutScene:
                 f"{adapter.info.title}; choose another --backbone, or train with `lapgs run --off`"
             )
         if not len(getattr(model.points, "points", ())):  # 3DGS's points are None if it cannot read their PLY
-            raise SceneError(why_no_points(Path(call.dataset.source_path)))
+            raise SceneError(why_no_points(source_path))
         for name in ("train_cameras", "test_cameras"):
             scales = getattr(scene, name, None)
             if not isinstance(scales, dict) or len(scales) != 1:
@@ -110,6 +113,17 @@ class CheckoutScene:
         cameras = {"train_cameras": train, "test_cameras": test}
         lists = {name: dict.fromkeys(getattr(self.scene, name), views) for name, views in cameras.items()}
         return with_values(self.scene, {"gaussians": gaussians, "model_path": model_path, **lists})
+
+
+@contextmanager
+def _missing_points_told(scene: Path) -> Iterator[None]:
+    """Turn a checkout's error that a scene's file of points is not there into one line."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        if Path(error.filename or "").stem.lower() == "points3d":
+            raise SceneError(why_no_points(scene)) from error
+        raise
 
 
 class _PointRecorder:

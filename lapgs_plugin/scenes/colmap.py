@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
-from lapgs_plugin.scenes.colmap_model import MODEL_FILES, Model, count_images, read_model
+from lapgs_plugin.scenes.colmap_model import MODEL_FILES, Model, count_images, points_files, read_model
 from lapgs_plugin.scenes.colmap_records import PosedImage
 from lapgs_plugin.scenes.images import find_image, where_else
 from lapgs_plugin.scenes.point_cloud import read_point_cloud
@@ -33,6 +33,9 @@ from lapgs_plugin.scenes.source import (
 
 MODEL_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0")
 """Where COLMAP, nerfstudio and the 3DGS repository's convert.py leave models of photos that are not undistorted."""
+
+SHORT_TRACK = 3
+"""Photos that see a point, of which some codebases of 3DGS leave out points with fewer."""
 
 
 def find_model(path: Path, folders: Sequence[str] = MODEL_PLACES[:2]) -> Path | None:
@@ -126,29 +129,51 @@ def source_of(model: Model, folder: Path) -> SceneSource:
     frames = [_frame(model.folder, folder, cameras[image.camera_id], image) for image in model.images.values()]
     points, colors, warnings = model.points.xyz, model.points.rgb / 255.0, model.warnings
     if not len(points) and frames:  # known cameras, of a phone or a renderer
-        warnings += (f"{model.folder}: the model has no 3D points; training starts from random ones",)
+        file = next(iter(points_files(model.folder)), model.folder)
+        warnings += (f"{file}: the model has no 3D points; training starts from random ones",)
         points, colors = random_points(frames)
     return SceneSource("colmap", in_name_order(frames), (), points, colors, warnings)
 
 
 def why_no_points(path: Path) -> str:
     """Return the reason why a codebase of 3DGS finds no points in a scene folder, with advice, in one line."""
-    model = find_model(path)
-    ply, train = (model or path) / f"points3{'D' if model else 'd'}.ply", f"`lapgs train {quote(str(path))}`"
-    in_model = in_ply = 0
-    with suppress(SceneError):
-        in_model = 0 if model is None else len(read_model(model).points.xyz)
+    model, train = find_model(path), f"`lapgs train {quote(str(path))}`"
+    try:
+        in_model, photos = (0, 0) if model is None else _points_of_model(model)
+    except SceneError as error:
+        return str(error)
+    folder = model or path
+    ply, in_ply = folder / f"points3{'D' if model else 'd'}.ply", 0
     with suppress(SceneError):
         in_ply = len(read_point_cloud(ply, "").xyz)
-    if not is_file(ply):
-        return f"{model or path}: no points in it, expected some to start from; train with {train}, which makes them"
-    problem = f"its {in_ply} points are not readable for this codebase" if in_ply else "no points in it"
+    file = ply if is_file(ply) else next(iter(points_files(folder)), folder)
+    problem = f"{file}: " + (f"its {in_ply} points are not readable for this codebase" if in_ply else "no points in it")
+    if in_ply and not in_model:
+        return f"{problem}, expected x, y, z, nx, ny, nz, red, green and blue of each point; export it again"
     if not in_model:
-        return f"{ply}: {problem}, expected x, y, z, nx, ny, nz, red, green and blue of each point; export it again"
-    return (
-        f"{ply}: {problem}, expected the {in_model} of the model; remove the file, so that this codebase writes it "
-        f"again. If it is empty then, this codebase leaves out points without tracks: train with {train}"
-    )
+        expected = "expected some to start from; triangulate points with COLMAP and write the file again"
+        return f"{problem}, {expected}, or train with {train}, which makes random ones"
+    if file != ply:
+        problem = f"{file}: this codebase takes none of its points"
+    if photos < SHORT_TRACK:
+        return (
+            f"{problem}, expected the {in_model} of the model; none of these has {SHORT_TRACK} photos in its track, "
+            f"and some codebases leave such points out: triangulate them again with COLMAP and remove {ply.name}, or "
+            f"train with {train}, which needs no tracks"
+        )
+    again = f"remove {ply.name}, so that this codebase writes it again, or " if file == ply else ""
+    return f"{problem}, expected the {in_model} of the model; {again}train with {train}"
+
+
+def _points_of_model(folder: Path) -> tuple[int, int]:
+    """Return how many points a COLMAP model has beside its PLY, and the most photos that see one of them.
+
+    Raises:
+        SceneError: the model is incomplete or unreadable.
+    """
+    points = read_model(folder, observations=True).points
+    own = points_files(folder)[0].suffix != ".ply"
+    return (len(points.xyz), max(map(len, points.tracks), default=0)) if own else (0, 0)
 
 
 def is_straight(model: Model) -> bool:

@@ -114,13 +114,18 @@ def count_images(folder: Path) -> int:
     return 0
 
 
+def points_files(folder: Path) -> list[Path]:
+    """Return the files of a model's points, the one that is read first."""
+    return [file for suffix in ("bin", "txt", "ply") if is_file(file := folder / f"points3D.{suffix}")]
+
+
 def _formats(folder: Path) -> tuple[str, list[Path]]:
     """Return the suffix of a model's cameras and images, and the files of its points, the one to read first.
 
     Raises:
         SceneError: one is missing.
     """
-    points = [file for suffix in ("bin", "txt", "ply") if is_file(file := folder / f"points3D.{suffix}")]
+    points = points_files(folder)
     for suffix in ("bin", "txt"):
         if points and all(is_file(folder / f"{name}.{suffix}") for name in MODEL_FILES[:2]):
             return suffix, points

@@ -106,9 +106,22 @@ def test_a_scene_without_points_is_one_line(scene: Path, tmp_path: Path) -> None
     ply = tmp_path / "scene" / "sparse" / "0" / "points3D.ply"
     names = ("x", "y", "z", "red", "green", "blue")
     PlyData([PlyElement.describe(np.empty(0, [(name, "f4") for name in names]), "vertex")]).write(str(ply))
-    with pytest.raises(SceneError, match=rf"{ply}: no points in it, expected the \d+ of the model; remove") as caught:
+    with pytest.raises(SceneError, match=rf"{ply}: no points in it, expected the \d+ of the model; ") as caught:
         run_residuals(STUBS["graphdeco"], tmp_path / "scene", tmp_path / "run")
     assert f"lapgs train {tmp_path / 'scene'}" in one_line(caught.value)
+    assert nothing_written(tmp_path / "run")
+
+
+def test_a_file_of_points_that_is_not_there_is_one_line(scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(scene, tmp_path / "scene")
+    model = tmp_path / "scene" / "sparse" / "0"
+    for file in model.glob("points3D.*"):
+        file.unlink()
+    with pytest.raises(
+        SceneError, match=rf"^{model}: the sparse model is incomplete, .* expected .*points3D"
+    ) as caught:
+        run_residuals(STUBS["graphdeco"], tmp_path / "scene", tmp_path / "run")
+    one_line(caught.value)
     assert nothing_written(tmp_path / "run")
 
 

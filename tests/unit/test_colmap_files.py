@@ -279,12 +279,39 @@ def test_a_ply_beside_the_points_is_for_codebases(tmp_path: Path) -> None:
     assert len(source.points) == len(POINTS)
     (line,) = source.warnings
     assert f"{file}: 0 points in place of 40; points3D.bin is used, codebases of 3DGS use the PLY" in line
-    assert f"{file}: no points in it, expected the 40 of the model; remove the file" in why_no_points(path)
+    why = why_no_points(path)
+    assert f"{file}: no points in it, expected the 40 of the model; none of these has 3 photos in its track" in why
+    assert f"remove points3D.ply, or train with `lapgs train {path}`" in why
     (file.parent / "points3D.bin").unlink()
     write_ply(file, POINTS, COLORS.astype(np.uint8))
     np.testing.assert_allclose(load(path).points.numpy(), POINTS, rtol=0, atol=1e-6)  # 3DGS needs no other file then
     file.unlink()
     refused(path, r"incomplete, it has only cameras\.bin, images\.bin; expected")
+
+
+@pytest.mark.parametrize("written", ["ply", "bin", "ply and bin"])
+def test_a_scene_without_a_point_names_the_empty_file(tmp_path: Path, written: str) -> None:
+    path = make_scene(tmp_path, Model(points=POINTS[:0]))
+    folder = path / "sparse" / "0"
+    if "ply" in written:
+        write_ply(folder / "points3D.ply", POINTS[:0], COLORS[:0].astype(np.uint8))
+    if "bin" not in written:
+        (folder / "points3D.bin").unlink()
+    why = why_no_points(path)
+    assert why.startswith(f"{folder / 'points3D'}.{written.partition(' ')[0]}: no points in it, expected some")
+    assert "triangulate points with COLMAP" in why
+    assert f"train with `lapgs train {path}`" in why
+
+
+def test_points_that_three_photos_see_only_need_their_ply_again(tmp_path: Path) -> None:
+    path = make_scene(tmp_path, binary=False)
+    model = path / "sparse" / "0" / "points3D.txt"
+    model.write_text(model.read_text().replace("\n", " 1 0 2 0 3 0\n"))
+    ply = model.with_suffix(".ply")
+    write_ply(ply, POINTS[:0], COLORS[:0].astype(np.uint8))
+    assert f"{ply}: no points in it, expected the 40 of the model; remove points3D.ply, so" in why_no_points(path)
+    ply.unlink()
+    assert f"{model}: this codebase takes none of its points, expected the 40 of the model" in why_no_points(path)
 
 
 def test_a_transforms_file_beside_a_model(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

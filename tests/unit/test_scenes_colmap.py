@@ -446,7 +446,7 @@ def test_text_file_of_something_else(tmp_path: Path, name: str) -> None:
 
 def test_a_model_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     scene = load(make_scene(tmp_path, Model(points=np.empty((0, 3)))))
-    assert "the model has no 3D points; training starts from random ones" in caplog.text
+    assert "points3D.bin: the model has no 3D points; training starts from random ones" in caplog.text
     middle, reach = scene.points.mean(dim=0), (scene.points.amax(dim=0) - scene.points.amin(dim=0)).min() / 2
     assert middle.norm() < 0.2  # the cameras look past the origin by at most 0.19; seen 0.13
     assert scene.train[0].camera.position.norm() / 2 < reach
