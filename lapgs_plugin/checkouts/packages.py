@@ -22,7 +22,12 @@ DISTRIBUTIONS = {
 BUILT_IN = sys.stdlib_module_names | {"__main__"}
 """Modules of Python, some of them of other systems."""
 
-AUTO, OWN, OURS = "auto", "checkout", "lapgs"
+OWN = "checkout"
+"""The checkout's rasterizer."""
+OURS = "lapgs"
+"""Our rasterizer, by the rules of the checkout's."""
+AUTO = "auto"
+"""The faster of both where they agree; ours where the checkout's own is not to be had."""
 CHOICES = (AUTO, OWN, OURS)
 """Values of `--rasterizer`: whose rasterizer renders a checkout."""
 
@@ -30,7 +35,9 @@ COMPANIONS = ("simple_knn", "fused_ssim")
 """Compiled packages of the family besides its rasterizers."""
 
 INDEX = "pip install "
+"""How a package of the index is installed."""
 README = "install it as the checkout's README says"
+"""How a package is installed whose name on the index is not known."""
 
 
 @dataclass(frozen=True)

@@ -120,8 +120,8 @@ class Profile:
         """Return the names by which the script knows an object."""
         return {name for name, held in held_by(self.script.module) if held is value}
 
-    def places(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
-        """Return where the checkout looks a name of a rasterizer's module up, as owners and names."""
+    def rasterizer_holders(self, rasterizer: BoundRasterizer, name: str) -> list[tuple[ModuleType, str]]:
+        """Return modules in which the checkout looks up a name of a rasterizer's module, each with the name there."""
         use = rasterizer.use
         holders = self.holders(vars(rasterizer.module)[name])
         if use.inside:  # an import in a function looks the name up in the rasterizer's module at each call

@@ -17,14 +17,15 @@ from lapgs_plugin.checkouts.syntax import parsed_quietly
 FACTORY = "_lapgs_recompiled"
 """Name of the function that defines the function again; what its tree calls beside its globals are its arguments."""
 
-MADE = "_lapgs_made"
-"""Attribute of functions that were made again."""
+RECOMPILATION = "_lapgs_recompilation"
+"""Attribute of recompiled functions: their `_Recompilation`."""
 
 FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
+"""Flags of all future statements."""
 
 
-class _Made(NamedTuple):
-    """Hold the tree of a function that was made again, and what it calls beside its globals."""
+class _Recompilation(NamedTuple):
+    """Hold the tree of a recompiled function, and what it calls beside its globals."""
 
     tree: ast.FunctionDef
     names: Mapping[str, Callable[..., Any]]
@@ -73,7 +74,7 @@ def tree_of(function: Callable[..., Any]) -> ast.FunctionDef | None:
     """
     if not isinstance(function, FunctionType) or hasattr(function, "__wrapped__"):
         return None
-    recompilation: _Made | None = getattr(function, MADE, None)
+    recompilation: _Recompilation | None = getattr(function, RECOMPILATION, None)
     if recompilation is not None:
         return copy.deepcopy(recompilation.tree)
     path = Path(function.__code__.co_filename)
@@ -109,9 +110,9 @@ def recompiled(
     Args:
         function: the original.
         tree: a changed `tree_of` it.
-        names: what the tree calls beside the original's globals, and beside the names that the original was made with.
+        names: what the tree calls beside the original's globals and the names with which it was recompiled before.
     """
-    before: _Made | None = getattr(function, MADE, None)
+    before: _Recompilation | None = getattr(function, RECOMPILATION, None)
     names = {**({} if before is None else before.names), **(names or {})}
     original = inspect.unwrap(function)
     assert isinstance(original, FunctionType), "as it has a tree"
@@ -126,5 +127,5 @@ def recompiled(
     exec(compiled, original.__globals__, defined)
     recompiled_function: Callable[..., Any] = defined[FACTORY](*names.values())
     recompiled_function.__qualname__ = function.__qualname__
-    setattr(recompiled_function, MADE, _Made(tree, names))
+    setattr(recompiled_function, RECOMPILATION, _Recompilation(tree, names))
     return recompiled_function

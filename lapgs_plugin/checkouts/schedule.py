@@ -37,8 +37,10 @@ LIBRARIES = ("torch", "np", "numpy", "math", "random", "os", "time", "sys", "F",
 """Modules whose functions say nothing about what an event does."""
 
 FLIPPED = {ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE}
+"""The operator of a comparison whose sides change places."""
 
-Place = tuple[int, int, int | None, int | None]
+Position = tuple[int, int, int | None, int | None]
+"""Where an expression stands in its source: its first and last line and column."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Event:
     def describe(self, variables: Mapping[str, Any]) -> str:
         """Return one line: the condition, with the values of options that are known, and the functions it calls."""
         known = {
-            _place(operand.written): operand.value(variables)
+            _position_of(operand.written): operand.value(variables)
             for operand in self.operands
             if operand.option is not None or operand.node is not operand.written
         }
@@ -297,15 +299,15 @@ class StageSchedule:
     _variable: str  # of its loop
     options: dict[tuple[str, str], Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    _numbers: dict[Place, int] = field(default_factory=dict)
-    _moved: dict[Place, int] = field(default_factory=dict)
+    _numbers: dict[Position, int] = field(default_factory=dict)
+    _moved: dict[Position, int] = field(default_factory=dict)
 
     def set(self, operand: Operand, before: int, after: int) -> None:
         """Give an operand another value."""
         if before == after or operand.option in self.options:
             return
         if operand.option is None:
-            self._numbers[_place(operand.node)] = after
+            self._numbers[_position_of(operand.node)] = after
         else:
             self.options[operand.option] = after
         self.notes.append(f"{operand.text if operand.option else before} -> {after}")
@@ -323,12 +325,12 @@ class StageSchedule:
         def now(operand: Operand) -> int | None:
             if operand.option in self.options:
                 return int(self.options[operand.option])
-            return self._numbers.get(_place(operand.node), operand.number(variables))
+            return self._numbers.get(_position_of(operand.node), operand.number(variables))
 
         assert event.period is not None
         last, start = event.last(end, now), end - end // RARE
         if last > start:
-            self._moved[_place(event.period.comparison)] = start
+            self._moved[_position_of(event.period.comparison)] = start
             self.notes.append(f"{', '.join(event.calls)} at {last} -> {start}")
 
     def applied_to(self, call: TrainingCall) -> TrainingCall:
@@ -375,15 +377,15 @@ class StageSchedule:
 class _Rewriter(ast.NodeTransformer):
     """Replace numbers and options by numbers, and add the iteration of a moved event to its comparison."""
 
-    numbers: Mapping[Place, Any]
-    moved: Mapping[Place, int] = field(default_factory=dict)
+    numbers: Mapping[Position, Any]
+    moved: Mapping[Position, int] = field(default_factory=dict)
     options: Mapping[tuple[str, str], Any] = field(default_factory=dict)
     variable: str = ""
 
     def visit(self, node: ast.AST) -> Any:
         if not isinstance(node, ast.expr):
             return self.generic_visit(node)
-        position = _place(node)
+        position = _position_of(node)
         if position in self.numbers and not isinstance(node, ast.Compare):
             return ast.copy_location(ast.Constant(self.numbers[position]), node)
         option = _option(node)
@@ -409,7 +411,7 @@ def _option(node: ast.expr) -> tuple[str, str] | None:
     return None
 
 
-def _place(node: ast.expr) -> Place:
+def _position_of(node: ast.expr) -> Position:
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 

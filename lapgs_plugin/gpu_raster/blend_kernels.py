@@ -54,14 +54,20 @@ from lapgs_plugin.gpu_raster.walk_kernels import (
 from lapgs_plugin.ops.launch import launch
 
 OF_GRADIENT = tl.constexpr(GRADIENT)
+"""Numbers of a Gaussian's gradients that lie together."""
 OTHERS = {(False, False): 1, (True, False): 3, (False, True): 3, (True, True): 5}
 """Numbers of a Gaussian's other gradients, by whether there are absolute sums, and 1 / depth.
 
 They are that by c; two absolute sums, or one without meaning; that by 1 / depth. The number is odd, so that addresses
 of several lanes have no order in which Triton would spread them over threads, see `_backward_kernel`.
 """
-FORWARD_REGISTERS, BACKWARD_REGISTERS = 72, 80
-"""At most for a thread: with fewer for each, an H200 runs more warps beside each other, until they do not suffice."""
+FORWARD_REGISTERS = 72
+"""Most registers of a forward kernel's thread.
+
+With fewer an H200 runs more warps beside each other, until the registers do not suffice.
+"""
+BACKWARD_REGISTERS = 80
+"""The same of a backward kernel's thread."""
 
 
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "of_background"))

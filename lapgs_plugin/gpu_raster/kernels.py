@@ -45,8 +45,10 @@ BEYOND = tl.constexpr(0.3)
 """The Jacobian is that of a point this share of half the image beyond its border at most."""
 CENTRED = tl.constexpr(JACOBIAN_LIMIT)
 """The family's limit of the Jacobian, in half images from the centre."""
-SIGMAS, LEAST_ROOT = tl.constexpr(RADIUS_SIGMAS), tl.constexpr(MIN_ROOT)
-"""Constants of the family's three-sigma radius."""
+SIGMAS = tl.constexpr(RADIUS_SIGMAS)
+"""The family's radius of a Gaussian, in standard deviations along its longer axis."""
+LEAST_ROOT = tl.constexpr(MIN_ROOT)
+"""The family's lower bound of half the difference of the 2D covariance's eigenvalues, squared."""
 LARGEST = tl.constexpr(MAX_RADIUS)
 """Largest radius of a Gaussian in pixels."""
 OVERFLOWN = tl.constexpr(1e37)

@@ -8,14 +8,15 @@ import torch
 import triton
 import triton.language as tl
 
-INTERPRETED, OTHER_MAKER = os.environ.get("TRITON_INTERPRET") == "1", torch.version.hip is not None
-PLAIN = tl.constexpr(INTERPRETED or OTHER_MAKER)
+ON_AMD = torch.version.hip is not None
+"""Whether this PyTorch is built for AMD's GPUs."""
+PLAIN = tl.constexpr(ON_AMD or os.environ.get("TRITON_INTERPRET") == "1")
 """Do without NVIDIA's assembly, which neither Triton's interpreter nor AMD's GPUs know."""
 
 
 def at_most(registers: int) -> dict[str, int]:
     """Return the option of a launch that limits a thread's registers; AMD's compiler knows none."""
-    return {} if OTHER_MAKER else {"maxnreg": registers}
+    return {} if ON_AMD else {"maxnreg": registers}
 
 
 @triton.jit

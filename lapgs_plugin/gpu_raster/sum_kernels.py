@@ -37,9 +37,14 @@ from lapgs_plugin.ops.launch import launch
 
 SUMS = 5
 """Of weights, of 1, of shares, of distances; and one without meaning, see `blend_kernels.OTHERS`."""
-OF_SUMS, SQUARES, REMAINDERS = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
-"""What a launch adds up: `SUMS`, squared gradients, or weights times shares times what is left behind each Gaussian."""
+OF_SUMS = tl.constexpr(0)
+"""Add up a Gaussian's `SUMS`."""
+SQUARES = tl.constexpr(1)
+"""Add up squared gradients."""
+REMAINDERS = tl.constexpr(2)
+"""Add up weights times shares times the transmittance behind each Gaussian."""
 LAST = tl.constexpr(2**31 - 1)
+"""Rank behind that of every pair."""
 
 
 @triton.jit

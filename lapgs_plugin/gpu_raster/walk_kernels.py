@@ -21,8 +21,10 @@ WARP = 32
 """Threads of a warp."""
 COLUMNS = 4
 """Columns of pixels of a warp's region."""
-LANES, SPLAT_LANES = tl.constexpr(COLUMNS), tl.constexpr(WARP // COLUMNS)
-"""A warp's threads: this many columns of pixels by this many Gaussians."""
+LANES = tl.constexpr(COLUMNS)
+"""Threads of a warp along columns of pixels."""
+SPLAT_LANES = tl.constexpr(WARP // COLUMNS)
+"""Threads of a warp along Gaussians."""
 AT_ONCE = tl.constexpr(2 * WARP)
 """Pairs that a warp reads at once."""
 QUEUE = tl.constexpr(4 * WARP)
@@ -31,13 +33,15 @@ LOG2_E = tl.constexpr(1.4426950408889634)
 """Logarithm of e to base 2."""
 FAINTEST = tl.constexpr(1 / 255)
 """Alpha below which a Gaussian does not blend into a pixel."""
-OPAQUEST, OPAQUEST_OF_FAMILY = tl.constexpr(0.999), tl.constexpr(MAX_ALPHA)
-"""Largest alpha of a Gaussian in a pixel: gsplat's, and the family's."""
+OPAQUEST = tl.constexpr(0.999)
+"""Largest alpha of a Gaussian in a pixel by gsplat's rules."""
+OPAQUEST_OF_FAMILY = tl.constexpr(MAX_ALPHA)
+"""Largest alpha of a Gaussian in a pixel by the 3DGS family's rules."""
 LEAST = tl.constexpr(1e-4)
 """Transmittance that no pixel goes below: it ends before."""
 
-# Kernels are not compiled anew for other sizes.
 NOT_SPECIALIZED = ("width", "height", "across", "tiles", "known", "pairs")
+"""Arguments for whose values no kernel is compiled anew: they follow the image's size and the field's."""
 
 
 class Shape(NamedTuple):
@@ -58,8 +62,9 @@ class Shape(NamedTuple):
 
 
 SHAPE = Shape()
+"""Layout of launches that name no other."""
 REACH_WARPS = 4
-"""Of a program of the launch before; each thread tests a pair at once."""
+"""Warps of a program of `reach_kernel`; each thread tests a pair."""
 
 
 @triton.jit

@@ -354,13 +354,13 @@ class DryRun:
         except (LapgsError, torch.cuda.OutOfMemoryError):
             raise
         except Exception as error:
-            location = place_of(error, self._adapter)
+            location = source_line(error, self._adapter)
             raise UserInputError(
                 f"dry run: {what} failed at {location}: {typed_line(error)}; expected {expected}; {works}"
             ) from error
 
 
-def place_of(error: Exception, adapter: BackboneAdapter) -> str:
+def source_line(error: Exception, adapter: BackboneAdapter) -> str:
     """Return file and line, of the checkout or of another package's adapter of it, in which an error was raised."""
     root, modules = adapter.root, [ancestor.__module__ for ancestor in type(adapter).__mro__]
     brought = {getattr(sys.modules[name], "__file__", None) for name in modules if not name.startswith("lapgs_plugin.")}

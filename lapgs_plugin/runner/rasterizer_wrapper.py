@@ -107,11 +107,11 @@ class RasterizerWrapper:
             compared = rasterizer.module is profile.rasterizers[0].module
             ours = self._ours.get(rasterizer.use.module) if compared else None
             for name in rasterizer.settings:
-                makers += [(holder, self.settings) for holder in profile.places(rasterizer, name)]
+                makers += [(holder, self.settings) for holder in profile.rasterizer_holders(rasterizer, name)]
             for name in rasterizer.entries:
                 kind = self.wrap_class if inspect.isclass(vars(rasterizer.module)[name]) else self.wrap_function
                 make = partial(kind, ours=getattr(ours, name, None))
-                makers += [(holder, make) for holder in profile.places(rasterizer, name)]
+                makers += [(holder, make) for holder in profile.rasterizer_holders(rasterizer, name)]
         return [Replacement(*holder, make, consumer) for holder, make in makers]
 
     @contextmanager

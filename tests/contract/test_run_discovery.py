@@ -79,11 +79,12 @@ def test_two_rasterizers_of_one_name_are_each_replaced_once(
     with (checkouts / "graphdeco" / "gaussian_renderer" / "__init__.py").open("a") as file:
         file.write(f"\n\ndef scores():\n    from {OTHER} import GaussianRasterizer\n    return GaussianRasterizer()\n")
     with loaded(STUBS["graphdeco"], scene, tmp_path, script=checkouts / "graphdeco" / "train.py") as adapter:
-        places = {
-            each.use.module: [owner.__name__ for owner, _ in adapter.profile.places(each, "GaussianRasterizer")]
-            for each in adapter.profile.rasterizers
+        name, holders = "GaussianRasterizer", adapter.profile.rasterizer_holders
+        modules = {
+            rasterizer.use.module: [module.__name__ for module, _ in holders(rasterizer, name)]
+            for rasterizer in adapter.profile.rasterizers
         }
-    assert places == {MODULE: ["gaussian_renderer"], OTHER: [OTHER]}
+    assert modules == {MODULE: ["gaussian_renderer"], OTHER: [OTHER]}
 
 
 def test_a_scene_that_reads_its_cameras_is_no_camera(scene: Path, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_run_after_a_dry_run_is_the_bare_run(name: str, scene: Path, tmp_path:
     assert len(printed) == 1, "the dry run prints nothing"
 
 
-def test_the_place_of_an_error_is_in_the_checkout_or_in_a_packages_adapter(
+def test_the_line_of_an_error_is_in_the_checkout_or_in_a_packages_adapter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modules = {}
@@ -80,17 +80,17 @@ def test_the_place_of_an_error_is_in_the_checkout_or_in_a_packages_adapter(
     adapter = modules["site/tiny_adapter"].Adapter()
     adapter.root = tmp_path / "checkout"
 
-    def place(function: Callable[[], object]) -> str:
+    def line_of(function: Callable[[], object]) -> str:
         with pytest.raises(ZeroDivisionError) as caught:
             function()
-        return dry_run.place_of(caught.value, adapter)
+        return dry_run.source_line(caught.value, adapter)
 
     def fails() -> None:
         elsewhere(lambda: 1 / 0)
 
-    assert place(lambda: checkout(lambda: site(fails))) == "tiny_adapter.py:6"
-    assert place(lambda: site(lambda: checkout(fails))) == "scene.py:6"
-    assert place(fails).startswith("test_run_dry.py:"), "the innermost, where neither takes part"
+    assert line_of(lambda: checkout(lambda: site(fails))) == "tiny_adapter.py:6"
+    assert line_of(lambda: site(lambda: checkout(fails))) == "scene.py:6"
+    assert line_of(fails).startswith("test_run_dry.py:"), "the innermost, where neither takes part"
 
 
 FAILURES = {

@@ -17,8 +17,12 @@ from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.runs.level_images import LevelImages
 from lapgs_plugin.scenes.parallel import in_threads
 
-IMAGE, MASK, POINTS = "image", "mask", "points"
-"""Entries of a dataset's item that depend on the image's size, besides "K"."""
+IMAGE = "image"
+"""Entry of a dataset's item: the photo."""
+MASK = "mask"
+"""Entry of a dataset's item: which pixels count."""
+POINTS = "points"
+"""Entry of a dataset's item: where the scene's points are in the image, in pixels."""
 
 
 @dataclass(frozen=True)
