@@ -134,6 +134,8 @@ def _loss_versions(ours: str, render: Tensor, target: Tensor, coarse: Tensor | N
         target, coarse = (255 * target).to(torch.uint8), None if coarse is None else coarse.half()
 
     def in_parts(loss: Callable[[Tensor, Tensor, float], Tensor]) -> Callable[[], Tensor]:
+        """Return a loss of the composed image, with Up, decoding and the loss as operations of their own."""
+
         def composed_loss() -> Tensor:
             image = leaf if coarse is None else leaf + upsample.upsample(pyramid, coarse.float(), size)
             return loss(image, photometric_loss.decoded(target), DEFAULT_SSIM_WEIGHT)

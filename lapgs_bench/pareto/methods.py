@@ -108,12 +108,13 @@ def run_spec(method: Method, settings: ParetoSettings, scene: Path, iterations: 
 
 
 def job_of(spec: RunSpec, scene: Path, folder: Path, evaluate: Sequence[str] | None) -> Job:
-    """Return a run for a worker.
+    """Return the job by which a worker makes a run of a method: its commands, run folder and log.
 
     Args:
+        spec: the run.
         scene: the scene's folder.
         folder: where runs and logs are written.
-        evaluate: options of `lapgs eval`; None leaves it out.
+        evaluate: options of `lapgs eval`; None for a short run that only tells the machine's rate.
     """
     name = spec.run_id if evaluate is not None else f"rate-{spec.run_id}"
     own = folder.absolute() / RUNS / name

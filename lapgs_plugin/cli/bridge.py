@@ -154,7 +154,7 @@ def _build_chosen(registry: Registry[Any], by: str, name: str, arguments: dict[s
     return kind(**values)
 
 
-def given_options(context: typer.Context) -> set[str]:
+def chosen_options(context: typer.Context) -> set[str]:
     """Return the names of the parameters that the command line or a settings file sets."""
     sources: Mapping[str, Any] = {name: context.get_parameter_source(name) for name in context.params}
     return {name for name, source in sources.items() if getattr(source, "name", "") in ("COMMANDLINE", "DEFAULT_MAP")}

@@ -178,13 +178,13 @@ def _rasterizer_on_gpu(source: CheckoutSource) -> Finding:
 
     kind, option = adapter_class(source.root), "--rasterizer auto"
     try:
-        found = compiled_modules(source, lambda: kind.stand_in_for(source.root, ()))
+        modules = compiled_modules(source, lambda: kind.stand_in_for(source.root, ()))
     except MissingExtraError as error:
         return Finding(option, "absent", str(error))
-    whose = "that of lapgs" if found.rasterizer == OURS else "the checkout's own"
-    if found.beside:
+    whose = "that of lapgs" if modules.rasterizer == OURS else "the checkout's own"
+    if modules.beside:
         whose = "the checkout's own or that of lapgs: the dry run of `lapgs run` compares and times both"
-    return Finding(option, "ok", "; ".join(filter(None, (whose, found.hindrance, found.describe()))))
+    return Finding(option, "ok", "; ".join(filter(None, (whose, modules.hindrance, modules.describe()))))
 
 
 def _stand_in(source: CheckoutSource) -> Finding:

@@ -14,7 +14,7 @@ import typer
 
 from lapgs_plugin.adapters.registry import GENERIC, OWN, adapter_class
 from lapgs_plugin.checkouts import packages
-from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.bridge import chosen_options, takes_settings
 from lapgs_plugin.cli.output import log_to_stderr
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
@@ -107,7 +107,7 @@ def run(
     from lapgs_plugin.environment.device import chosen_device
     from lapgs_plugin.runner.installed_packages import require_packages
 
-    if options.off and (idle := sorted(given_options(context) - OF_OFF)):
+    if options.off and (idle := sorted(chosen_options(context) - OF_OFF)):
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
     plain = options.off and not options.record
@@ -265,10 +265,10 @@ def _compiled_modules(
 
     source = CheckoutSource.read(script)
     fitting = partial(kind.stand_in_for, source.root, arguments)
-    found = compiled_modules(source, fitting, options.rasterizer, bare=options.off)
-    if line := found.describe():
+    modules = compiled_modules(source, fitting, options.rasterizer, bare=options.off)
+    if line := modules.describe():
         logging.getLogger(__name__).info("%s", line)
-    return found
+    return modules
 
 
 def _recognised(script: Path, backbone: str | None, *, needed: bool) -> type[BackboneAdapter] | None:

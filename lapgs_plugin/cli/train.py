@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.bridge import chosen_options, takes_settings
 from lapgs_plugin.cli.config_file import ConfigOption, extended_config, write_config
 from lapgs_plugin.cli.output import log_to_stderr, make_console, say
 from lapgs_plugin.cli.rehearsal import Rehearsal
@@ -82,7 +82,7 @@ def train(
     from lapgs_plugin.training.preparation import TrainRequest, prepare
 
     log_to_stderr("%(message)s")
-    given = {name for name in given_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
+    chosen = {name for name in chosen_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
     request = TrainRequest(
         scene=scene,
         out=out,
@@ -91,7 +91,7 @@ def train(
         control=control,
         resume=start.resume,
         overwrite=start.overwrite,
-        given=frozenset(given),
+        chosen=frozenset(chosen),
         **({"began": context.obj} if isinstance(context.obj, float) else {}),
     )
     watcher = context.with_resource(watching(start.viewing, out.absolute().name))

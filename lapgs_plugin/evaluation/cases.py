@@ -49,9 +49,9 @@ class Case:
         return rasterizer(self.field, self.camera, background=self.background_tensor, sh_degree=self.sh_degree)
 
 
-def pixel_weights(case: Case, seed: int = 0) -> Tensor:
+def pixel_weights(case: Case) -> Tensor:
     """Return (3, h, w) random weights of both signs; their product with an image is a loss without symmetry."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     shape = (3, case.camera.height, case.camera.width)
     return torch.randn(shape, generator=generator, dtype=torch.float64).to(case.field.means)
 
@@ -128,11 +128,11 @@ def make_field(
     return GaussianField(means.double(), quaternions, scales.log(), torch.logit(opacities), sh, signed)
 
 
-def points_in_view(n: int, camera: Camera, *, seed: int, near: float = 1.0, far: float = 6.0) -> Tensor:
+def points_in_view(n: int, camera: Camera, *, seed: int, near: float = 1.0) -> Tensor:
     """Return (n, 3) world points, uniform in depth and over the image, which they exceed by a tenth of its sides."""
     generator = torch.Generator().manual_seed(seed)
     u, v, d = torch.rand(3, n, generator=generator, dtype=torch.float64)
-    depth = near + (far - near) * d
+    depth = near + (6.0 - near) * d
     x = ((1.2 * u - 0.1) * camera.width - camera.cx) / camera.fx * depth
     y = ((1.2 * v - 0.1) * camera.height - camera.cy) / camera.fy * depth
     return to_world(torch.stack([x, y, depth], dim=-1), camera)

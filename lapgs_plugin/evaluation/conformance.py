@@ -276,8 +276,8 @@ def _compare(
     for name, wanted in wanted_gradients.items():
         got = actual.gradients.get(name)
         if got is not None and wanted is not None:
-            errors[name], found = _compare_gradients(name, got, wanted, mask.kinks, _bounds(subject, case.name, name))
-            problems += found
+            errors[name], further = _compare_gradients(name, got, wanted, mask.kinks, _bounds(subject, case.name, name))
+            problems += further
     return replace(outcome, errors=errors, band_error=band_error, problems=tuple(problems))
 
 

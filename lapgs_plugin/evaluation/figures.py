@@ -2,16 +2,16 @@
 
 Its keys, with levels as text as JSON requires:
     psnr, ssim, lpips_<variant>: means over the views, at full resolution; PSNR in dB.
-    fitted_psnr: mean PSNR after a colour fit, see `color_fitted_psnr`; absent in older files.
+    fitted_psnr: mean PSNR after a colour fit, see `color_fitted_psnr`.
     lpips_missing: by variant, why it could not be measured.
     fps: frames a second of the composed image, the median over some views.
     split, num_views: the measured views, "test", "train" or "other" (of a scene that was not trained on), and their
         number.
-    masked: whether pixels outside of masks were left out; absent in older files.
+    masked: whether pixels outside of masks were left out.
     exposure_compensated: whether the run learned colour transforms of its photos, so that its renders have their mean
-        exposure; absent in older files.
+        exposure.
     exposure_predicted: whether they were measured with the exposure that neighbouring photos predict, see
-        `predicted_exposures`; absent in older files.
+        `predicted_exposures`.
     train_seconds and other figures of training: see `training_figures`.
     levels: by level, the figures of `OF_LEVELS` and two means over the views: psnr of I_hat^l against level l of the
         photo's Gaussian pyramid, both at the level's size; and upsampled_psnr of I_hat^l upsampled to full resolution
@@ -48,13 +48,14 @@ from lapgs_plugin.runs.training_figures import VIEW_PSNR, training_figures
 from lapgs_plugin.scenes.scene import View
 
 METRIC_KEYS = {
-    *("psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
+    *("psnr", "fitted_psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
+    *("masked", "exposure_compensated", "exposure_predicted"),
     *("train_seconds", "overhead_seconds", "breakdown_seconds"),
     *("num_gaussians", "weighted_gaussians"),
     *("mean_gaussians", "peak_gaussians", "peak_memory_bytes", "peak_memory_without_images_bytes"),
     *("rasterizer", "versions"),
 }
-"""Keys that older files have too."""
+"""Keys that every file has."""
 
 OF_LEVELS = (
     *("iterations", "image_size", "train_seconds", "num_gaussians", "mean_gaussians", "peak_gaussians"),

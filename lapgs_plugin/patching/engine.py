@@ -74,19 +74,18 @@ class SetStatus:
     problems: tuple[str, ...] = ()
 
 
-def find_targets(checkout: Path, recipes: Sequence[Recipe] | None = None) -> tuple[Target, ...]:
+def find_targets(checkout: Path) -> tuple[Target, ...]:
     """Return the known extensions in a checkout: the folder itself, or folders up to `DEPTH` levels below it.
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
-        recipes: of the extensions to find; None for all that come with this package.
 
     Raises:
         PatchError: `checkout` is not a folder or has no known extension.
     """
     if not is_folder(checkout):
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
-    recipes = load_recipes() if recipes is None else recipes
+    recipes = load_recipes()
     folders = [checkout, *sorted(_subfolders(checkout))]
     targets = tuple(Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder))
     if not targets:

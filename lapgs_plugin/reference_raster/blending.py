@@ -91,10 +91,10 @@ class TiledBlending:
             inside = (here_x < self.view.width) & (here_y < self.view.height)
             if not len(members):
                 continue
-            found = splats[members]
-            dx, dy = here_x[inside] - found[:, CENTRE_X, None], here_y[inside] - found[:, CENTRE_X + 1, None]
-            xx, xy, yy = (found[:, FACTOR_XX + i, None] for i in range(3))
-            exponent = found[:, LOG2_OPACITY, None] - (xx * dx + xy * dy) ** 2 - (yy * dy) ** 2
+            records = splats[members]
+            dx, dy = here_x[inside] - records[:, CENTRE_X, None], here_y[inside] - records[:, CENTRE_X + 1, None]
+            xx, xy, yy = (records[:, FACTOR_XX + i, None] for i in range(3))
+            exponent = records[:, LOG2_OPACITY, None] - (xx * dx + xy * dy) ** 2 - (yy * dy) ** 2
             last = final[tile, :, 1].ravel()[inside]  # position of the last Gaussian that is blended
             blended = (exponent >= LOG2_MIN_ALPHA) & (np.arange(1, len(members) + 1)[:, None] <= last)
             alpha = np.where(blended, np.minimum(np.exp2(exponent), MAX_ALPHA), 0.0)
@@ -104,18 +104,18 @@ class TiledBlending:
                 here_y[inside].astype(np.int64) * self.view.width + here_x[inside],
                 alpha,
                 np.concatenate([np.ones_like(behind[:1]), behind[:-1]]),
-                found[:, RED : RED + 3],
-                np.exp2(found[:, LOG2_OPACITY]),
+                records[:, RED : RED + 3],
+                np.exp2(records[:, LOG2_OPACITY]),
             )
 
     def leaders(self, ranks: int = 1) -> NDArray[np.int64]:
         """Return the Gaussians with the largest shares of each pixel, (ranks, height * width); -1 where are fewer."""
-        found = np.full((ranks, self.view.width * self.view.height), -1, np.int64)
+        leaders = np.full((ranks, self.view.width * self.view.height), -1, np.int64)
         for tile in self.tiles:
             order = np.argsort(-tile.weights, axis=0, kind="stable")[:ranks]  # (ranks, p)
             any_share = np.take_along_axis(tile.weights, order, 0) > 0
-            found[: len(order), tile.pixels] = np.where(any_share, tile.members[order], -1)
-        return found
+            leaders[: len(order), tile.pixels] = np.where(any_share, tile.members[order], -1)
+        return leaders
 
     def weighted_shares(self, weights: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the sum over pixels of weight times alpha times the transmittance behind the Gaussian, (n,).

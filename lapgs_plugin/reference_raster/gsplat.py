@@ -91,7 +91,7 @@ def rasterization(
     """
     if len(viewmats) > 1:
         options = {"sh_degree": sh_degree, "absgrad": absgrad, "tile_size": tile_size, **conventions}
-        each = [
+        renders = [
             rasterization(
                 means, quats, scales, opacities, colors if colors.ndim == 2 or sh_degree is not None else colors[i],
                 viewmats[i : i + 1], Ks[i : i + 1], width, height,
@@ -99,7 +99,7 @@ def rasterization(
             )
             for i in range(len(viewmats))
         ]  # fmt: skip
-        return torch.cat([images for images, _, _ in each]), torch.cat([alphas for _, alphas, _ in each]), {}
+        return torch.cat([images for images, _, _ in renders]), torch.cat([alphas for _, alphas, _ in renders]), {}
     for name, value in conventions.items():
         if value not in CONVENTIONS.get(name, ()):
             raise UserInputError(f"{name}={value!r}: expected {CONVENTIONS.get(name, 'no such argument')} on the CPU")
@@ -140,5 +140,5 @@ def _with_gradient(means2d: Tensor, absgrad2d: Tensor | None) -> Tensor:
                 centres.absgrad = absgrad2d[None]
 
         means2d.register_post_accumulate_grad_hook(hand_over)  # type: ignore[no-untyped-call]  # torch leaves it without types
-    found: Tensor = centres
-    return found
+    screen_means: Tensor = centres
+    return screen_means

@@ -336,15 +336,15 @@ class Ellipses:
         low = corners - self.means2d[which].detach()  # (i, 2)
         high = low + TILE  # (i, 2)
         xx, xy, yy = self.conics[which].detach().unbind(-1)  # (i,) each
-        found = []
+        distances = []
         for x in (low[:, 0], high[:, 0]):  # on an edge, the point nearest to its line's own nearest point
             y = (-xy * x / yy).clamp(low[:, 1], high[:, 1])
-            found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+            distances.append(xx * x * x + 2 * xy * x * y + yy * y * y)
         for y in (low[:, 1], high[:, 1]):
             x = (-xy * y / xx).clamp(low[:, 0], high[:, 0])
-            found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+            distances.append(xx * x * x + 2 * xy * x * y + yy * y * y)
         around = ((low <= 0) & (high >= 0)).all(1)  # (i,) the centre is in the tile
-        return torch.stack(found).amin(0).masked_fill(around, 0)
+        return torch.stack(distances).amin(0).masked_fill(around, 0)
 
 
 def tile_lists(depths: Tensor, rectangles: Tensor, camera: Camera, ellipses: Ellipses | None = None) -> TileLists:

@@ -170,8 +170,8 @@ def _list_by_tile(
         for row in range(first, end):
             left, right = _span(splats, i * SPLAT, reach, half, row, tiles_x)
             for column in range(left, right):
-                place = starts[row * tiles_x + column]
-                starts[row * tiles_x + column] = place + 1
-                members[place] = i
-                places[pair] = place
+                slot = starts[row * tiles_x + column]
+                starts[row * tiles_x + column] = slot + 1
+                members[slot] = i
+                places[pair] = slot
                 pair += 1

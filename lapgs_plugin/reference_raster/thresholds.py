@@ -346,7 +346,11 @@ def _at_clamp(field: GaussianField, camera: Camera, ids: Tensor, degree: int, to
 def _open_pixels(
     bounded: _Bounded, camera: Camera, tolerance: float, ellipses: _Ellipses | None
 ) -> tuple[Tensor, Tensor]:
-    """Return (h, w) True where a decision is open, and (v,) True where it is open whether an ellipse meets any tile."""
+    """Return the pixels and the Gaussians for which rounding can turn a comparison of blending.
+
+    Returns:
+        (h, w) for each pixel, and (v,) whether rounding decides if a Gaussian's ellipse meets any tile.
+    """
     lists = tile_lists(bounded.depths, bounded.possibly, camera)
     offsets = torch.arange(TILE, dtype=torch.float64, device=bounded.depths.device)  # (16,)
     mask = torch.zeros(lists.rows, lists.columns, TILE, TILE, dtype=torch.bool, device=bounded.depths.device)

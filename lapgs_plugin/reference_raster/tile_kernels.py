@@ -206,7 +206,10 @@ def blend(
 
 @inline
 def _open_tile(state: Floats, offsets: Floats, tile_x: int, tile_y: int, width: int, height: int) -> int:
-    """Set pixels to black and transparent; return the blocks, as bits, that hold pixels of the image."""
+    """Start blending a tile: set its pixels to black with transmittance 1; return the blocks with pixels, as bits.
+
+    Lanes outside of the image get transmittance -1, which counts as opaque.
+    """
     alive = 0
     for block in range(BLOCKS):
         inside = (pixels_x(offsets, block, tile_x) < width) & (pixels_y(offsets, block, tile_y) < height)

@@ -118,7 +118,7 @@ def _weak_levels(run: MeasuredRun) -> list[str]:
     manifest, metrics = run.archive.manifest, run.metrics
     gains: Sequence[float] = ()
     if metrics["split"] == "test":
-        at_end = {int(level): figures.get(VIEW_PSNR, ()) for level, figures in metrics["levels"].items()}
+        at_end = {int(level): figures[VIEW_PSNR] for level, figures in metrics["levels"].items()}
         logged = last_view_psnrs(run.archive.history(), along=False)
         gains = smaller_gains(finest_gains(at_end), finest_gains(logged))
     return weak_levels(manifest.records, gains, manifest.settings, advised=knows_options(manifest))

@@ -29,7 +29,7 @@ from lapgs_plugin.checkouts.model_values import explain_values_beside, values_be
 from lapgs_plugin.checkouts.packages import OWN
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import TrainingCall
-from lapgs_plugin.errors import LapgsError, UserInputError, first_line, typed_line
+from lapgs_plugin.errors import DeviceMemoryError, LapgsError, UserInputError, first_line, typed_line
 from lapgs_plugin.evaluation.metrics import mean_quality
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
@@ -445,6 +445,23 @@ def undisturbed(device: torch.device) -> Iterator[None]:
             logging.disable(disabled)
             random.setstate(states[0])
             np.random.set_state(states[1])
+
+
+@contextmanager
+def full_gpu_told() -> Iterator[None]:
+    """Turn the error of a full GPU before the first stage into one line.
+
+    Raises:
+        DeviceMemoryError: the GPU was full.
+    """
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise DeviceMemoryError(
+            "dry run: out of GPU memory, before anything was written; expected room for an iteration of the coarsest "
+            "level; free what other programs use (nvidia-smi lists them), or take more --levels or a smaller "
+            f"resolution [{first_line(error)}]"
+        ) from error
 
 
 def _silent_writer(train: Any) -> Any:

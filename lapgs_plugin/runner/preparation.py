@@ -21,7 +21,7 @@ from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext, TrainingRun
-from lapgs_plugin.runner.dry_run import DryRun
+from lapgs_plugin.runner.dry_run import DryRun, full_gpu_told
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
 from lapgs_plugin.runner.rasterizer_choice import Decision, decided_without_trials
 from lapgs_plugin.runner.stage_pruning import require_pruning
@@ -74,12 +74,13 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
         if not settings.has_residuals:
             plan = between_events(plan, schedule, call.variables)
         dry_run = DryRun(context, call, scene, plan, schedule)
-        rasterizer = _choose_rasterizer(context, dry_run, absolute)
-        path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
-        if settings.dry_run:
-            dry_run.run(Path(scratch, "dry_run"), path)
-        elif not settings.has_residuals and (context.hooks or images.masked):
-            dry_run.find_image()
+        with full_gpu_told():
+            rasterizer = _choose_rasterizer(context, dry_run, absolute)
+            path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
+            if settings.dry_run:
+                dry_run.run(Path(scratch, "dry_run"), path)
+            elif not settings.has_residuals and (context.hooks or images.masked):
+                dry_run.find_image()
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test), rasterizer)
         with _open_archive(context, absolute, manifest) as archive:
             yield TrainingRun(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +10,6 @@ from lapgs_plugin.checkouts.compiled_modules import CompiledModules
 from lapgs_plugin.checkouts.packages import AUTO, OURS, OWN
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.runs.manifest import Manifest
-
-logger = logging.getLogger(__name__)
 
 GAIN = 1.05
 """Times as fast as the checkout's own that ours has to be: less may be chance, and its own needs no reason."""
@@ -131,7 +128,7 @@ def _kept(modules: CompiledModules, manifest: Manifest) -> Decision | None:
 
 
 def recorded_choice(manifest: Manifest) -> Decision | None:
-    """Return the choice that a run was trained with; None for runs of earlier versions and of a CPU."""
+    """Return the choice that a run was trained with; None for runs on a CPU."""
     recorded: Any = manifest.settings.get(CHOICE)
     if not isinstance(recorded, dict) or recorded.get("taken") not in (OWN, OURS):
         return None

@@ -55,7 +55,7 @@ class MetricsOfLevel(StrictWithMore):
 
     psnr: float
     upsampled_psnr: float
-    view_psnr: NotRequired[list[float]]
+    view_psnr: list[float]
     start_gaussians: NotRequired[NonNegativeInt | None]
     iterations: PositiveInt
     image_size: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]

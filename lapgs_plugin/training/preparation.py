@@ -53,7 +53,7 @@ class TrainRequest:
         resume: continue the run in `out`; a finished one is extended if there are more iterations than it has, and an
             unfinished one that gets a time ends with it.
         overwrite: replace the run in `out`.
-        given: options that the user chose, by parameter name. A run that is continued must have been started with the
+        chosen: options that the user chose, by parameter name. A run that is continued must have been started with the
             same. A new run on few photos gets fewer iterations if they are not among them.
 
         began: when the seconds of --time began, by `time.monotonic`.
@@ -69,14 +69,14 @@ class TrainRequest:
     control: TrainingControl = field(default_factory=TrainingControl)
     resume: bool = False
     overwrite: bool = False
-    given: frozenset[str] = frozenset({"iterations"})
+    chosen: frozenset[str] = frozenset({"iterations"})
     began: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
             raise UserInputError("--resume and --overwrite contradict each other; give one of them")
         if (text := self.settings.time) is not None:
-            if {"time", "iterations"} <= self.given:
+            if {"time", "iterations"} <= self.chosen:
                 raise UserInputError(f"--time {text} with --iterations: both say how long to train; give one of them")
             if self.control.gpu_busy:
                 raise UserInputError(
@@ -124,7 +124,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
 
     def decide(size: tuple[int, int], photos: int) -> None:
         nonlocal settings
-        if "iterations" not in request.given and (fewer := settings.for_photos(photos)) != settings:
+        if "iterations" not in request.chosen and (fewer := settings.for_photos(photos)) != settings:
             settings = fewer
             say(
                 f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
@@ -158,7 +158,7 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
     rate, seconds = views_per_second(scene, settings, placed), parse_duration(settings.time)
     require_time_left(settings.time, spent := time.monotonic() - request.began)
     iterations = max(settings.levels, round(rate * (seconds - spent)))
-    settings = settings.lasting(iterations, choose="strategy" not in request.given).for_size(scene.smallest_size)
+    settings = settings.lasting(iterations, choose="strategy" not in request.chosen).for_size(scene.smallest_size)
     require_pruning(make_plan(scene.smallest_size, settings, len(scene.train)), settings)
     say(
         f"--time {settings.time}: {seconds - spent:.1f} s are left for training, about {iterations:,} iterations of "
@@ -169,28 +169,28 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
 
 @contextmanager
 def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
-    """Yield the run in a folder, with those settings of `MAY_CHANGE` that were given, or with more iterations."""
+    """Yield the run in a folder, with those settings of `MAY_CHANGE` that the user chose, or with more iterations."""
     out, scene_folder = Path(request.out), Path(request.scene)
     with one_line_errors(out, "read"):
         begun = (out / MANIFEST).is_file()
     if not begun:
         raise RunFolderError(f"{out} is not a run, so there is nothing to continue; leave --resume out to start one")
     with RunArchive.open(out, resume=True) as archive:
-        manifest, given = archive.manifest, request.given
+        manifest, chosen = archive.manifest, request.chosen
         file = archive.path(MANIFEST)
         _require_same_folder(out, Path(manifest.scene.path), scene_folder)
         settings = settings_from_manifest(manifest, str(file))
         if manifest.complete:
-            asked = request.settings.iterations if "iterations" in given else None
+            asked = request.settings.iterations if "iterations" in chosen else None
             _require_untimed(out, settings, request.settings, asked)
             if settings.time is None:
                 settings = extended_settings(archive, settings, asked, say)
             else:
                 say(f"{out} is finished: its --time {settings.time} is over")
-            given -= {"iterations"}
+            chosen -= {"iterations"}
         wanted = _options(reference, request.settings, request.control.rasterizer)
-        _require_same(out, given, wanted, _options(manifest.scene, settings, manifest.rasterizer))
-        changed = {name: wanted[name] for name in MAY_CHANGE if name in given}
+        _require_same(out, chosen, wanted, _options(manifest.scene, settings, manifest.rasterizer))
+        changed = {name: wanted[name] for name in MAY_CHANGE if name in chosen}
         began = request.began if changed.get("time") != settings.time and "time" in changed else None
         settings = replace(settings, **changed)
         with nullcontext() if changed else errors_about(file):
@@ -254,9 +254,9 @@ def _require_same_folder(out: Path, before: Path, scene: Path) -> None:
         )
 
 
-def _require_same(out: Path, given: frozenset[str], wanted: dict[str, Any], started_with: dict[str, Any]) -> None:
-    """Refuse given options that are not those of the run."""
-    for name in sorted(given & wanted.keys() - set(MAY_CHANGE)):
+def _require_same(out: Path, chosen: frozenset[str], wanted: dict[str, Any], started_with: dict[str, Any]) -> None:
+    """Refuse chosen options that are not those of the run."""
+    for name in sorted(chosen & wanted.keys() - set(MAY_CHANGE)):
         if name not in started_with:  # another strategy's
             raise UserInputError(
                 f"--{name.replace('_', '-')} is no option of --strategy {started_with['strategy']}, with which the "

@@ -132,6 +132,7 @@ class Controls:
         return tab
 
     def _folder(self, name: str) -> Any:
+        """Add a titled group of controls, which goes with the panel."""
         folder = self._gui.add_folder(name)
         self._parts.append(folder)
         return folder
@@ -178,8 +179,7 @@ class Controls:
         chosen: Any = self._gui.add_dropdown("view", tuple(views), initial_value=views[0])
         step = self._gui.add_button_group("go", ("previous", "here", "next"))
 
-        @step.on_click
-        def _(_: object) -> None:
+        def go_on(_: object) -> None:
             offset = {"previous": -1, "here": 0, "next": 1}[step.value]
             index = (views.index(chosen.value) + offset) % len(views)
             if offset == 0:
@@ -187,18 +187,20 @@ class Controls:
             else:
                 chosen.value = views[index]  # calls `on_update`, which moves the camera
 
+        step.on_click(go_on)
         chosen.on_update(lambda _: go_to(views.index(chosen.value)))
 
     def _add_path(self, keep: Callable[[], int], save: Callable[[], None]) -> None:
         count = self._gui.add_markdown("Keep views to render a clip through them.")
-        press = self._gui.add_button_group("views", ("keep", "save"))
+        buttons = self._gui.add_button_group("views", ("keep", "save"))
 
-        @press.on_click
-        def _(_: object) -> None:
-            if press.value == "keep":
+        def keep_or_save(_: object) -> None:
+            if buttons.value == "keep":
                 count.content = f"{keep()} views kept"
             else:
                 save()
+
+        buttons.on_click(keep_or_save)
 
     def _band_name(self, level: int) -> str:
         if self._run.renderer.levels == 1:

@@ -121,6 +121,7 @@ def guarded_server(guard: Guard) -> Iterator[None]:
 
 def _guarded(guard: Guard, answer: ProcessRequest | None) -> ProcessRequest:
     def process_request(connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse a browser's request as the guard says, or answer it as viser does."""
         refusal = guard.refusal(request)
         if refusal is not None:
             status, reason = refusal

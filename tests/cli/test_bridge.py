@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from lapgs_plugin.cli.bridge import given_options, takes_settings
+from lapgs_plugin.cli.bridge import chosen_options, takes_settings
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import option, option_values, parameter_name
 
@@ -59,7 +59,7 @@ def work(
     plain: Annotated[int, typer.Option(help="Declared in the signature.")] = 3,
 ) -> None:
     """Work on TARGET."""
-    names = given_options(context)
+    names = chosen_options(context)
     CALLS.append({"target": target, "settings": settings, "extra": extra, "plain": plain, "given": names})
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runner import dry_run
 from lapgs_plugin.runner.stage_views import StageViews
@@ -143,6 +143,23 @@ def test_what_fails_is_one_line_with_its_place(failure: str, scene: Path, tmp_pa
         pytest.raises(UserInputError, match=message) as caught,
     ):
         drive(adapter, dry_run=True, hierarchy="laplacian" if failure.startswith("residuals") else "nested")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_that_is_full_already_costs_no_run(scene: Path, tmp_path: Path) -> None:
+    checkouts = Path(shutil.copytree(CHECKOUTS, tmp_path / "c", ignore=shutil.ignore_patterns("__pycache__")))
+    script = checkouts / "graphdeco" / "train.py"
+    text, line = script.read_text(encoding="utf-8"), "        loss = (1.0 - opt.lambda_dssim)"
+    full = 'raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")'
+    assert line in text
+    script.write_text(text.replace(line, f"        {full}\n{line}"), encoding="utf-8")
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT, script=script) as adapter,
+        pytest.raises(DeviceMemoryError, match=r"^dry run: out of GPU memory, .* --levels .* 2\.00 GiB\]$") as caught,
+    ):
+        drive(adapter, dry_run=True)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
 

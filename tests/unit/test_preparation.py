@@ -65,7 +65,7 @@ def trained(request: TrainRequest, monitor: Monitor | None = None) -> RunArchive
             {"settings": replace(SHORT, time="9s"), "control": TrainingControl(gpu_busy=True)},
             "--gpu-busy with --time 9s",
         ),
-        ({"settings": replace(SHORT, time="9s", levels=4), "given": frozenset()}, "level 3 of 4 would be 8x6 pixels"),
+        ({"settings": replace(SHORT, time="9s", levels=4), "chosen": frozenset()}, "level 3 of 4 would be 8x6 pixels"),
         ({"resume": True}, "is not a run, so there is nothing to continue"),
     ],
 )
@@ -92,7 +92,7 @@ def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> 
     with pytest.raises(UserInputError, match=r"--iterations asks for 21, but the run in .* was started with 20"):
         trained(replace(again, settings=TrainSettings(iterations=21)))
     with pytest.raises(UserInputError, match=r"--resolution asks for full, but .* was started with 1/2"):
-        trained(replace(again, given=frozenset({"resolution"})))
+        trained(replace(again, chosen=frozenset({"resolution"})))
     with prepare(again) as run, pytest.raises(RunFolderError, match="is being written by process"), prepare(again):
         pass
     assert (run.resumes, run.settings.accumulate_views, run.plan[0].image_size) == (True, 2, (32, 24))
@@ -102,20 +102,20 @@ def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> 
     assert (longer.manifest.settings["iterations"], longer.manifest.settings["extended"]) == (24, 4)
 
 
-@pytest.mark.parametrize(("given", "iterations"), [(frozenset(), 5000), (frozenset({"iterations"}), 30_000)])
+@pytest.mark.parametrize(("chosen", "iterations"), [(frozenset(), 5000), (frozenset({"iterations"}), 30_000)])
 def test_few_photos_shorten_a_run_whose_iterations_were_not_chosen(
-    folder: Path, tmp_path: Path, given: frozenset[str], iterations: int
+    folder: Path, tmp_path: Path, chosen: frozenset[str], iterations: int
 ) -> None:
     said: list[str] = []
-    with prepare(TrainRequest(folder, tmp_path / "run", given=given), said.append) as run:
+    with prepare(TrainRequest(folder, tmp_path / "run", chosen=chosen), said.append) as run:
         assert run.settings.iterations == run.plan.iterations == iterations
         assert run.archive.manifest.settings["iterations"] == iterations
-    assert any("16 training photos: 5,000 iterations" in line for line in said) is not bool(given)
+    assert any("16 training photos: 5,000 iterations" in line for line in said) is not bool(chosen)
 
 
 def test_a_time_that_reading_takes_is_refused_before_anything_is_written(folder: Path, tmp_path: Path) -> None:
     settings = replace(SHORT, time="3s")
-    late = TrainRequest(folder, tmp_path / "run", settings, given=frozenset(), began=time.monotonic() - 4.0)
+    late = TrainRequest(folder, tmp_path / "run", settings, chosen=frozenset(), began=time.monotonic() - 4.0)
     with (
         pytest.raises(UserInputError, match=r"--time 3s: reading the scene and compiling took \d+\.\d s"),
         prepare(late),
@@ -128,12 +128,12 @@ def test_the_machine_decides_how_many_iterations_a_time_has(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And with them the strategy, unless the user chose it."""
-    for rate, given, strategy in ((100.0, {"time"}, "mcmc"), (5.0, {"time"}, "3dgs"), (5.0, {"strategy"}, "mcmc")):
+    for rate, chosen, strategy in ((100.0, {"time"}, "mcmc"), (5.0, {"time"}, "3dgs"), (5.0, {"strategy"}, "mcmc")):
         monkeypatch.setattr(preparation, "views_per_second", lambda *_, rate=rate: rate)
         settings = TrainSettings(time="10m", densification=Densification(strategy="mcmc"))
         said: list[str] = []
         out = tmp_path / f"{rate}-{strategy}"
-        with prepare(TrainRequest(folder, out, settings, given=frozenset(given)), said.append) as run:
+        with prepare(TrainRequest(folder, out, settings, chosen=frozenset(chosen)), said.append) as run:
             assert run.plan.iterations == run.settings.iterations == pytest.approx(600 * rate, rel=0.1)
             assert run.settings.densification.strategy == strategy
             assert run.archive.manifest.settings["time"] == "10m"
@@ -146,7 +146,7 @@ def test_an_unfinished_run_that_gets_a_time_ends_with_it(folder: Path, tmp_path:
         trained(
             TrainRequest(folder, tmp_path / "run", replace(SHORT, iterations=100_000), SceneOptions()), StopAt(0, 500)
         )
-    ends = TrainRequest(folder, tmp_path / "run", replace(SHORT, time="4s"), resume=True, given=frozenset({"time"}))
+    ends = TrainRequest(folder, tmp_path / "run", replace(SHORT, time="4s"), resume=True, chosen=frozenset({"time"}))
     archive = trained(ends)
     assert 500 < archive.manifest.record(0).iterations < 50_000
     assert archive.manifest.settings["time"] == "4s"
@@ -155,7 +155,7 @@ def test_an_unfinished_run_that_gets_a_time_ends_with_it(folder: Path, tmp_path:
     with pytest.raises(UserInputError, match=r"--time 5s: the run in .* is finished"):
         trained(replace(ends, settings=replace(SHORT, time="5s")))
     with pytest.raises(UserInputError, match=r"--iterations 20: the run in .* was trained for --time 4s"):
-        trained(replace(ends, settings=SHORT, given=frozenset({"iterations"})))
+        trained(replace(ends, settings=SHORT, chosen=frozenset({"iterations"})))
 
 
 def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def triton_works(device: torch.device) -> float:
 
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(700, 3, generator=generator).to(device)
-    found = []
+    results = []
     for step in (step_rows_torch, step_rows_triton):
         values, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
         generator.manual_seed(1)
@@ -55,5 +55,5 @@ def triton_works(device: torch.device) -> float:
             gradient = torch.randn(start.shape, generator=generator).to(device)
             marked = (torch.rand(len(start), generator=generator) < 0.5).to(device)
             step(values, gradient, mean, square, marked, 0.1, ADAM_EPS)
-        found.append(values)
-    return largest([(found[0] - found[1]).abs() / (found[0] - start).abs().max()])
+        results.append(values)
+    return largest([(results[0] - results[1]).abs() / (results[0] - start).abs().max()])

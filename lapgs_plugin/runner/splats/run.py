@@ -25,6 +25,7 @@ from lapgs_plugin.options import option_name
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
 from lapgs_plugin.registry import HOOKS, chosen_entries
+from lapgs_plugin.runner.dry_run import full_gpu_told
 from lapgs_plugin.runner.manifest import require_same_run
 from lapgs_plugin.runner.rasterizer_choice import CHOICE, Decision, recorded_choice
 from lapgs_plugin.runner.settings import RunSettings
@@ -158,7 +159,8 @@ def prepare(request: SplatRequest, own: Rasterizer, trainer: Any, began: int) ->
     size = smallest_of(view.camera for view in (*train, *test))
     settings = settings.for_size(size)
     plan = StagePlan.create(size, config.max_steps, settings.levels, settings.shares, settings.kind)
-    rasterizer, decision = _choose_rasterizer(request, own, trainer, train, plan, folder)
+    with full_gpu_told():
+        rasterizer, decision = _choose_rasterizer(request, own, trainer, train, plan, folder)
     manifest = _manifest(request, settings, config, plan, reference, decision)
     with _open_archive(request, folder, manifest, began) as archive:
         for attribute, value in vars(trainer).items():
