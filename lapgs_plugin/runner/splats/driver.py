@@ -20,7 +20,6 @@ import copy
 import logging
 import os
 import shlex
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -42,7 +41,6 @@ from lapgs_plugin.runner.splats.schedule import set_threshold, stage_config
 from lapgs_plugin.runner.splats.signed import FinishedField, Rasterizer
 from lapgs_plugin.runner.splats.stage import SplatStage
 from lapgs_plugin.runner.splats.views import LevelBatches
-from lapgs_plugin.runs.layout import CACHE
 
 logger = logging.getLogger(__name__)
 
@@ -197,16 +195,16 @@ class SplatDriver:
                 self._run, self._folder, self._rasterizer = run, run.archive.path(), run.rasterizer
                 run.request.watcher.run_started(run.archive)
                 try:
-                    returned = self._train_stages() if run.settings.has_residuals else self._train_nested()
+                    with run.image_cache():
+                        returned = self._train_stages() if run.settings.has_residuals else self._train_nested()
                 except torch.cuda.OutOfMemoryError as error:
                     raise DeviceMemoryError(
-                        f"out of GPU memory; finished levels ({list(run.archive.available_levels)}) are kept; "
+                        f"out of GPU memory; finished levels ({run.finished_levels}) are kept; "
                         "--images-on memory takes images off the GPU, more --levels or a larger --data_factor help too "
                         f"[{first_line(error)}]"
                     ) from error
                 finally:
                     self._stage = self._advance = None
-                    shutil.rmtree(run.archive.path(CACHE), ignore_errors=True)
             logger.info("run folder: %s; next: `lapgs eval %s`", run.folder, shlex.quote(str(run.folder)))
             return returned
 

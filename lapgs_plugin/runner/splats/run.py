@@ -39,6 +39,7 @@ from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.trained_cameras import TrainedCameras
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.scene import load_cameras, smallest_of
+from lapgs_plugin.stages.run import StagedRun
 
 logger = logging.getLogger(__name__)
 
@@ -80,33 +81,27 @@ class SplatRequest:
 
 
 @dataclass(frozen=True)
-class SplatRun:
+class SplatRun(StagedRun):
     """Hold a run that is ready to train.
 
     Attributes:
         settings: those of the request, with the defaults for the photos' size.
+        request: what the user asks for.
+        rasterizer: renders the script's calls.
         trainer: the script's object whose `train` was called.
         config: its settings, for the whole run.
         train, test: views of its datasets.
-        plan: the stages.
-        archive: the run folder, open for writing.
-        folder: its path as the user typed it.
+        folder: path of the run folder as the user typed it.
     """
 
-    request: SplatRequest
     settings: RunSettings
+    request: SplatRequest
     rasterizer: Rasterizer
     trainer: Any
     config: Any
     train: tuple[SplatView, ...]
     test: tuple[SplatView, ...]
-    plan: StagePlan
-    archive: RunArchive
     folder: Path
-
-    @property
-    def device(self) -> torch.device:
-        return torch.device(self.request.device)
 
     def window(self, stage: Stage) -> StageWindow:
         """Return the place of a stage in the run."""
@@ -167,7 +162,17 @@ def prepare(request: SplatRequest, own: Rasterizer, trainer: Any, began: int) ->
             if attribute.endswith("_dir"):  # those of an earlier run are removed, the script's new ones with them
                 Path(value).mkdir(parents=True, exist_ok=True)
         run = SplatRun(
-            request, settings, rasterizer, trainer, config, train, test, plan, archive=archive, folder=folder
+            settings=settings,
+            plan=plan,
+            archive=archive,
+            device=torch.device(request.device),
+            request=request,
+            rasterizer=rasterizer,
+            trainer=trainer,
+            config=config,
+            train=train,
+            test=test,
+            folder=folder,
         )
         write_cameras(run)
         yield run

@@ -17,7 +17,6 @@ from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats,
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.cameras import level_intrinsics
 from lapgs_plugin.hierarchy.plan import Stage, level_size
-from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.splats.joint import follow, trainable
@@ -25,10 +24,8 @@ from lapgs_plugin.runner.splats.run import SplatRun, write_cameras
 from lapgs_plugin.runner.splats.schedule import opacity_weight
 from lapgs_plugin.runner.splats.signed import COLORS, CoarserLevels, FinishedField, compose
 from lapgs_plugin.runner.splats.views import SplatView, camera_inputs, level_item, level_pixels
-from lapgs_plugin.runs.image_store import chosen_precision
-from lapgs_plugin.runs.layout import CACHE
-from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
@@ -47,9 +44,7 @@ class SplatStage:
 
     def __init__(self, run: SplatRun, stage: Stage, finished: Sequence[FinishedField] = ()) -> None:
         self._run, self.stage, self._trainer = run, stage, run.trainer
-        self._pyramid = Pyramid(run.settings.grid)
-        self._predictions: UpsampledImages | None = None
-        self._coarser = CoarserLevels(run.rasterizer, self._pyramid, finished) if finished else None
+        self._coarser = CoarserLevels(run.rasterizer, run.pyramid, finished) if finished else None
         self._joint, self._joint_from = False, run.settings.joint_from(stage)
         self._record = StageRecord(
             archive=run.archive,
@@ -58,11 +53,9 @@ class SplatStage:
             device=run.device,
             profiled=stage.iterations if run.request.measuring.gpu_busy else 0,
         )
-        sizes = [view.size for view in run.train]
-        folder = run.archive.path(CACHE)
-        self._stores = ImageStores(sizes, run.device, eight_bit=True, where=run.settings.images_on, folder=folder)
         masked = any(view.mask is not None for view in run.train)
-        self._images = LevelImages(self._stores, stage.level, self._pyramid, masked=masked)
+        self._sizes = {view.name: view.size for view in run.train}
+        self._images = StageImages(run, stage, self._sizes, eight_bit=True, masked=masked)
         self._batch: list[str] = []  # views of the running iteration
         self._items: dict[int, dict[str, Any]] = {}  # of views, without pixels
         self._opacity_weight = float(getattr(self._trainer.cfg, "opacity_reg", 0.0))
@@ -73,10 +66,10 @@ class SplatStage:
         run, (width, height) = self._run, self.stage.image_size
         with self._record.overhead.timed("pyramid"):
             for view in run.train:
-                self._images.put(view.name, view.image(run.device), view.mask)
+                self._images.photos.put(view.name, view.image(run.device), view.mask)
         if self._coarser is not None and self._joint_from != 1 and not self._moves_cameras:
             with self._record.overhead.timed("cache"):
-                self._predictions = self._predict_all(self._coarser)
+                self._images.predictions = self._predict_all(self._coarser)
         logger.info("level %d: %d iterations at %dx%d", self.stage.level, self.stage.iterations, width, height)
         if run.settings.fused_adam and run.device.type == "cuda":
             for optimizer in self._trainer.optimizers.values():
@@ -91,14 +84,14 @@ class SplatStage:
         self._batch.append(view.name)
         if index not in self._items:
             self._items[index] = level_item(view, self.stage.level, self._run.device)
-        return {**self._items[index], **level_pixels(view, self._images)}
+        return {**self._items[index], **level_pixels(view, self._images.photos)}
 
     def prefetch(self, index: int) -> None:
         """Start copying a training view's images to the device."""
         name = self._run.train[index].name
-        self._images.prefetch(name)
-        if self._predictions is not None:
-            self._predictions.prefetch(name)
+        self._images.photos.prefetch(name)
+        if self._images.predictions is not None:
+            self._images.predictions.prefetch(name)
 
     def iteration_begins(self) -> None:
         """Act before an iteration of the script's loop."""
@@ -139,8 +132,8 @@ class SplatStage:
     def _predict(self, inputs: Mapping[str, Any]) -> Tensor:
         """Return what the coarser levels predict for a call, (c, h, w, channels): kept, or rendered."""
         assert self._coarser is not None, "of a residual"
-        if torch.is_grad_enabled() and not self._joint and self._predictions is not None:
-            images = self._predictions.get(*self._batch)
+        if torch.is_grad_enabled() and not self._joint and self._images.predictions is not None:
+            images = self._images.predictions.get(*self._batch)
             return (images[None] if images.ndim == 3 else images).permute(0, 2, 3, 1)
         if self._joint:
             return self._coarser.predict(inputs)
@@ -154,7 +147,7 @@ class SplatStage:
         width, height = level_size(size, level)
         own = {**inputs, "Ks": level_intrinsics(inputs["Ks"], size, level), "width": width, "height": height}
         images, alphas, info = compose(self._run.rasterizer, own, self._coarser.predict)
-        full = (to_full_size(batch.permute(0, 3, 1, 2), size, level, self._pyramid) for batch in (images, alphas))
+        full = (to_full_size(batch.permute(0, 3, 1, 2), size, level, self._run.pyramid) for batch in (images, alphas))
         image, alpha = (batch.permute(0, 2, 3, 1) for batch in full)
         return image, alpha, info
 
@@ -179,22 +172,21 @@ class SplatStage:
     @torch.no_grad()
     def _predict_all(self, coarser: CoarserLevels) -> UpsampledImages:
         """Return what the coarser levels predict for the training views."""
-        level = self.stage.level
-        precision = chosen_precision(self._run.settings.prediction_precision, self._run.device)
-        kept = self._stores.make_upsampled(level + 1, precision, f"predictions_{level + 1}", self._pyramid)
-        for view in self._run.train:
-            width, height = level_size(view.size, level)
-            image = coarser.composed(self._camera_inputs(view))[0, ..., :COLORS].permute(2, 0, 1)
-            kept.put(view.name, image.contiguous(), (height, width))
-        return kept
+        views, level = {view.name: view for view in self._run.train}, self.stage.level + 1
+
+        def predict(name: str) -> Tensor:
+            image = coarser.composed(self._camera_inputs(views[name]))[0, ..., :COLORS]
+            return image.permute(2, 0, 1).contiguous()
+
+        return self._images.cache(level, f"predictions_{level}", self._sizes, predict)
 
     def _train_jointly(self) -> None:
         """Optimize the finished fields, too, and render them instead of reading their predictions."""
         assert self._coarser is not None, "a residual has coarser levels"
         fields = [trainable(field, self._run.device) for field in self._coarser.fields]
-        self._coarser, self._joint = CoarserLevels(self._run.rasterizer, self._pyramid, fields), True
+        self._coarser, self._joint = CoarserLevels(self._run.rasterizer, self._run.pyramid, fields), True
         follow(self._coarser, self._trainer.optimizers, self._run.settings.color_factor, self._run.device)
-        self._drop_predictions()
+        self._images.drop_predictions()
 
     def finish(self) -> None:
         """Archive the field after the stage's last iteration.
@@ -236,12 +228,6 @@ class SplatStage:
     def close(self) -> None:
         """Drop the stage's images."""
         self._images.close()
-        self._drop_predictions()
-
-    def _drop_predictions(self) -> None:
-        if self._predictions is not None:
-            self._predictions.close()
-            self._predictions = None
 
     @torch.no_grad()
     def _held_out_qualities(self) -> list[dict[str, float]]:
@@ -259,7 +245,7 @@ class SplatStage:
 
     def _beside_photo(self, view: SplatView, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return an image (3, h, w) of the level at full size, and the view's photo."""
-        whole = to_full_size(image.contiguous(), view.size, self.stage.level, self._pyramid)
+        whole = to_full_size(image.contiguous(), view.size, self.stage.level, self._run.pyramid)
         return whole, view.image(self._run.device)
 
     def _refined_camera(self, index: int) -> Camera:
