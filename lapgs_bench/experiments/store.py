@@ -30,6 +30,7 @@ from lapgs_plugin.files import one_line_errors, require_own
 from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 
 FORMAT_VERSION = 1
+"""Version of the tables; a store of another version is refused."""
 LEASE = 120.0
 """Seconds that a claim lasts without renewal. Clocks of machines that share a store must differ by less."""
 MAX_CLAIMS = 3

@@ -23,6 +23,7 @@ from lapgs_plugin.errors import LapgsError
 from lapgs_plugin.files import require_own
 
 RENEW_EVERY = LEASE / 8
+"""Seconds between two renewals of a claim."""
 LAST_LINES = 12
 """Lines of a failed run's log in the report."""
 

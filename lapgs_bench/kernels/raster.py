@@ -44,7 +44,8 @@ MAX_MEMORY = 1.5e9
 
 FAST_ITERATIONS = 3
 """Timed iterations of the fast contender in each turn; an untimed one before them fills the caches."""
-LEARNING_RATE = 1e-6  # so small that the scene keeps its statistics
+LEARNING_RATE = 1e-6
+"""Rate of the optimizer, so small that the scene keeps its statistics."""
 GAUSSIANS_OF_ALL_TURNS = {ORACLE: 400_000, GSPLAT: 200_000}
 """Slow contenders take part in as many turns as add up to this many Gaussians, at least in one."""
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 FLICKER_FRAMES = 120
+"""Frames of a path along which flicker is measured, unless the user says otherwise."""
 
 SHOWN_VIEWS = 12
 """Views listed on the terminal; metrics.json and the report list all."""

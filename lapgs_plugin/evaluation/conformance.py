@@ -52,6 +52,7 @@ BOUNDS = {
 RULES = ("three_sigma_cut", "mult", "antialiasing", "exact_antialiasing", "blur")
 """Fields of `Semantics` that are options of the oracle."""
 ROW_FLOOR = 1e-3
+"""Share of the largest norm of a gradient below which rows are compared as if they had that norm."""
 ROUNDINGS = 16
 """Width of the band, in epsilon of the float type."""
 

@@ -15,7 +15,9 @@ from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.settings import INHERIT_MODES, parse_inheritance
 
 INITIAL_OPACITY = 0.1
+"""Opacity of Gaussians that are made of points."""
 NEIGHBOURS = 3
+"""Nearest points whose distances give a new Gaussian's size."""
 SAME_PLACE = 1e-4
 """Points closer than this, in median distances of all points from their middle, are at one place."""
 SINGLE_SIZE = math.sqrt(1e-7)

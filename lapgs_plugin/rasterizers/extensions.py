@@ -51,8 +51,10 @@ OTHER_INPUTS: dict[str, Callable[[Tensor], Tensor | None]] = {
     "gt_image": lambda means: None,
 }
 """Inputs that some rasterizers cannot do without, given centres (n, 3): with these values they change no image."""
-NEAR, FAR = 0.01, 100.0
-"""Clipping planes of the projection matrix; the kernels only use its other rows."""
+NEAR = 0.01
+"""Near plane of the projection matrix, of which the kernels only use other rows."""
+FAR = 100.0
+"""Far plane of the projection matrix."""
 SH_REST_COUNT = 15
 """Coefficients above the first at degree 3."""
 POINT_DIMMING = 0.005

@@ -16,6 +16,7 @@ from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.runs.profiling import clock_on
 
 ROUNDS = 5
+"""Times that each view is rendered."""
 BATCH = 8
 """Views in a batch; batches are measured on a GPU if there are as many views of one size."""
 

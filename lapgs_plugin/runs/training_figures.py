@@ -20,9 +20,10 @@ LEAST_VIEWS = 4
 """Fewest held-out views whose gains say whether a level matters."""
 LEAST_ITERATIONS = 500
 """Fewest iterations of a finest level that should change images."""
-VIEW_PSNR, COARSER_VIEW_PSNR = "view_psnr", "coarser_view_psnr"
-"""Keys of the history and of metrics.json: PSNR in dB of each held-out view at full size, in the scene's order; the
-second without the level, by the coarser levels as they are when it ends."""
+VIEW_PSNR = "view_psnr"
+"""Key of the history and of metrics.json: PSNR in dB of each held-out view at full size, in the scene's order."""
+COARSER_VIEW_PSNR = "coarser_view_psnr"
+"""Key of the history: the same without the level, by the coarser levels as they are when it ends."""
 
 
 def weak_levels(

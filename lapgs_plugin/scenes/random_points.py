@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.scenes.source import Frame
 
 RANDOM_POINTS = 100_000
+"""Number of random points where a scene has none."""
 OBJECT_RADIUS = 1.3 / 4.03
 """Half the side of the cube of random points for a Blender scene, in mean distances of the cameras from its centre.
 3DGS uses 1.3 for NeRF's objects, whose cameras are 4.03 away."""

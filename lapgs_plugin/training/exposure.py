@@ -18,8 +18,10 @@ from lapgs_plugin.training.view_transforms import ViewTransforms
 
 DIFFERENT = 0.08
 """Spread of exposure in stops, see `MeasuredExposure`, from which on photos count as different."""
-FIRST_RATE, LAST_RATE = 1e-2, 1e-3
-"""Adam's step size at the start and the end of a run; its logarithm decays linearly."""
+FIRST_RATE = 1e-2
+"""Adam's step size at the start of a run; its logarithm decays linearly."""
+LAST_RATE = 1e-3
+"""Adam's step size at the end of a run."""
 
 
 def identities(views: int) -> Tensor:

@@ -26,8 +26,10 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import USUAL_EXTENT, Mcmc
 
-START_SCALE, START_OPACITY = 0.1, 0.5
-"""Factor on the sizes, and opacity, of a field that starts from points, as MCMC's authors have them."""
+START_SCALE = 0.1
+"""Factor on the sizes of a field that starts from points, as MCMC's authors have it."""
+START_OPACITY = 0.5
+"""Opacity of a field that starts from points, as MCMC's authors have it."""
 DEAD_OPACITY = 0.01
 """Gaussians with at most this opacity are moved. MCMC's authors wait until it is half of that."""
 LEAST_OPACITY = 0.005
@@ -46,9 +48,13 @@ NOISE = 5e5
 NOISE_VIEWS = 8
 """Views after which positions get the noise of all steps since: as many as a step has on a GPU if nothing else is asked
 for. After each single view it would take a CPU a fifth of the training time."""
-GROWTH, GROWTH_OF_STAGE, MOST_GROWTH = 1.05, 350.0, 1.5
-"""Factor on the number of Gaussians each time that some are added: MCMC's, or more in short stages, so that they grow
-as much as the stages of a run of 30,000 iterations."""
+GROWTH = 1.05
+"""Least factor on the number of Gaussians each time that some are added: MCMC's."""
+GROWTH_OF_STAGE = 350.0
+"""Factor by which all additions of a stage let the number grow, so that short stages grow as much as those of a run of
+30,000 iterations."""
+MOST_GROWTH = 1.5
+"""Largest factor each time that some are added."""
 SOLID = 0.1
 """Gaussians above this opacity would get less than a ten thousandth of the noise, and on a CPU they get none."""
 MOST_SIGMA = 32.0

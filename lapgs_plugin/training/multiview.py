@@ -26,8 +26,10 @@ SCORED_VIEWS = 10
 """Views that are rendered for scores."""
 HIGHEST_OPACITY = 0.8
 """Opacities are lowered to this at each refinement: nothing behind an opaque Gaussian gets a gradient."""
-LATE_OPACITY, LATE_BLAME = 0.1, 0.9
-"""After densification, Gaussians with a lower opacity or a larger blame are removed."""
+LATE_OPACITY = 0.1
+"""After densification, Gaussians with a lower opacity are removed."""
+LATE_BLAME = 0.9
+"""After densification, Gaussians with a larger blame are removed."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,10 @@ from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView
 
-FIRST_RATE, LAST_RATE = 0.1, 0.002
-"""Adam's step size at the start and the end of a run, in pixels of the full image that a turn shifts it by."""
+FIRST_RATE = 0.1
+"""Adam's step size at the start of a run, in pixels of the full image that a turn shifts it by."""
+LAST_RATE = 0.002
+"""The same at the end of a run."""
 LEAST_VARIATION = 1e-6
 """Similarity transforms that move cameras less than this, relative to the others, are not removed."""
 

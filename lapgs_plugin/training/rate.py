@@ -15,8 +15,10 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.settings import MOST_VIEWS, TrainSettings
 
-SECONDS, LEAST_STEPS = 0.5, 3
-"""Measure for so long, and at least so many steps."""
+SECONDS = 0.5
+"""Duration of the measurement."""
+LEAST_STEPS = 3
+"""Fewest steps of the measurement, however long they take."""
 
 
 def views_per_second(scene: Scene, settings: TrainSettings, placed: PlacedRasterizer) -> float:

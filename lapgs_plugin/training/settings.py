@@ -28,16 +28,22 @@ from lapgs_plugin.training.strategies import (
 from lapgs_plugin.training.time_budget import parse_duration
 from lapgs_plugin.untrusted import STRICT
 
-SH_RATE_VIEWS, MOST_SH_RATE = 32, 8.0
+SH_RATE_VIEWS = 32
 """The rate of SH above degree 0 is multiplied by (training views / SH_RATE_VIEWS), clamped to 1 ... MOST_SH_RATE: few
 views do not determine how colours depend on direction."""
+MOST_SH_RATE = 8.0
+"""Largest factor on the rate of SH above degree 0."""
 MOST_VIEWS = 8
 """Most views of one step if --views-per-step is auto."""
 
-LAST, BEST = "last", "best"
-"""Choices of --keep."""
-ON, OFF = "on", "off"
-"""Choices of --exposure, beside auto."""
+LAST = "last"
+"""Choice of --keep: the state after the last iteration."""
+BEST = "best"
+"""Choice of --keep: the state whose held-out views were best."""
+ON = "on"
+"""Choice of --exposure: learn colour transforms of the photos."""
+OFF = "off"
+"""Choice of --exposure: learn none."""
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"

@@ -29,8 +29,10 @@ GROW_THRESHOLD = 2e-4
 ABSGRAD_THRESHOLD = 8e-4
 """Default threshold on absolute gradients, which do not cancel and are larger: gsplat's recommendation."""
 
-PIXELS_A_GAUSSIAN, MOST_GAUSSIANS = 16, 1_000_000
-"""Limits of MCMC: a Gaussian has about as many parameters as this many pixels have values, 59 and 48."""
+PIXELS_A_GAUSSIAN = 16
+"""Pixels of the photos for each Gaussian of MCMC: they have about as many values as it has parameters, 48 and 59."""
+MOST_GAUSSIANS = 1_000_000
+"""Most Gaussians of MCMC by default."""
 FEW_PHOTOS = 40
 """Fewer training photos than that leave room for floaters."""
 USUAL_EXTENT = 5.0

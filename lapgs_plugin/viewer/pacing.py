@@ -10,7 +10,11 @@ TARGET_SECONDS = 0.05
 SETTLE_SECONDS = 0.15
 """Seconds without a change until a picture is drawn larger."""
 
-SMALLEST, STEP = 1.0 / 8.0, 2.0
+SMALLEST = 1.0 / 8.0
+"""Smallest scale of a picture."""
+
+STEP = 2.0
+"""Factor by which a picture at rest is larger than the last one."""
 
 
 class Pacing:

@@ -31,8 +31,10 @@ DEPTH_ONLY = ("D", "ED")
 """Modes of rendering depths only."""
 LEAST_ALPHA = 1e-10
 """Lower bound of the opacity by which "ED" divides, gsplat's."""
-NEAREST, FARTHEST = 0.01, 1e10
-"""Depths of gsplat's default near and far plane."""
+NEAREST = 0.01
+"""Depth of gsplat's default near plane."""
+FARTHEST = 1e10
+"""Depth of gsplat's default far plane."""
 MOST_COEFFICIENTS = 16
 """SH coefficients of a colour that the kernels can evaluate, those of degree 3."""
 MOST_NUMBERS = 2**31 - 1

@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 
 SEED = 0
+"""Seed of COLMAP's random choices, and of those of features for a vocabulary."""
 
 MOST_DESCRIPTORS = 65_536
 """Most features that a vocabulary is made of."""
