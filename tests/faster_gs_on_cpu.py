@@ -50,35 +50,37 @@ def diff_rasterize(
     densification_info: Tensor,
     rasterizer_settings: RasterizerSettings,
 ) -> Tensor:
-    given = rasterizer_settings
+    settings = rasterizer_settings
     parameters = means, scales, rotations, opacities, sh_coefficients_0, sh_coefficients_rest
     assert all(each.is_contiguous() for each in parameters), "the kernels read memory as it lies"
     assert opacities.shape == (len(means), 1)
-    assert not given.proper_antialiasing
+    assert not settings.proper_antialiasing
     with torch.no_grad():
-        depths = means @ given.w2c[2, :3] + given.w2c[2, 3]
-        seen = (depths >= given.near_plane) & (depths <= given.far_plane) & (opacities[:, 0].sigmoid() >= FAINTEST)
+        depths = means @ settings.w2c[2, :3] + settings.w2c[2, 3]
+        seen = (
+            (depths >= settings.near_plane) & (depths <= settings.far_plane) & (opacities[:, 0].sigmoid() >= FAINTEST)
+        )
         ids = seen.nonzero()[:, 0]
         ids = ids[depths[ids].argsort(stable=True)]
     covariances = world_covariances(rotations[ids], scales[ids])
-    centres, conics = _project(means[ids], covariances, given)
+    centres, conics = _project(means[ids], covariances, settings)
     if len(densification_info) and centres.requires_grad:
 
         def note(gradient: Tensor) -> None:
-            halves = torch.tensor([given.width / 2, given.height / 2])
+            halves = torch.tensor([settings.width / 2, settings.height / 2])
             densification_info[0, ids] += 1
             densification_info[1, ids] += (gradient * halves).norm(dim=1)
 
         centres.register_hook(note)
     sh = torch.cat([sh_coefficients_0, sh_coefficients_rest], 1)[ids]
-    directions = torch.nn.functional.normalize(means[ids] - given.cam_position, dim=-1)
-    colors = sh_to_color(sh, directions, math.isqrt(given.active_sh_bases) - 1, signed=False)
-    rows, columns = (torch.arange(side) + 0.5 for side in (given.height, given.width))
+    directions = torch.nn.functional.normalize(means[ids] - settings.cam_position, dim=-1)
+    colors = sh_to_color(sh, directions, math.isqrt(settings.active_sh_bases) - 1, signed=False)
+    rows, columns = (torch.arange(side) + 0.5 for side in (settings.height, settings.width))
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 1, 2)  # (p, 1, 2)
     away = centres - pixels  # (p, m, 2)
     powers = (away[..., None, :] @ conics @ away[..., None])[..., 0, 0]  # (p, m)
     alphas = opacities[ids, 0].sigmoid() * torch.exp(-0.5 * powers.clamp_min(0))
-    inside = (centres > 0).all(1) & (centres < torch.tensor([given.width, given.height])).all(1)
+    inside = (centres > 0).all(1) & (centres < torch.tensor([settings.width, settings.height])).all(1)
     assert bool(((alphas >= FAINTEST).any(0) | inside).any()), "invalid configuration argument: a grid of no blocks"
     alphas = torch.where(alphas >= FAINTEST, alphas, 0.0)
     with torch.no_grad():
@@ -86,8 +88,8 @@ def diff_rasterize(
         blended = before >= LEAST_LEFT
     alphas = torch.where(blended, alphas, 0.0)
     left = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(1)], 1)
-    image = (left[:, :-1] * alphas) @ colors + left[:, -1:] * given.bg_color
-    return image.T.reshape(3, given.height, given.width)
+    image = (left[:, :-1] * alphas) @ colors + left[:, -1:] * settings.bg_color
+    return image.T.reshape(3, settings.height, settings.width)
 
 
 BACKEND = SimpleNamespace(diff_rasterize=diff_rasterize, RasterizerSettings=RasterizerSettings)

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
-from lapgs_plugin.gpu_raster.records import Parameters, Projected, grid_of, records_of
+from lapgs_plugin.gpu_raster.records import Parameters, Projected, grid_of
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
+from tests.gaussian_records import records_of
 
 FAINTEST, OPAQUEST, LAST = 1 / 255, 0.999, 1e-4
 """Alpha that is blended at least and at most, and the transmittance that no pixel goes below."""
@@ -73,15 +74,15 @@ def _intersect(
     most = torch.tensor([columns, rows])
     first = ((means2d - radii) / tile).floor().clamp_min(0).minimum(most).nan_to_num().int().tolist()
     past = ((means2d + radii) / tile).ceil().clamp_min(0).minimum(most).nan_to_num().int().tolist()
-    found, counts = [], [0] * len(depths)
+    pairs, counts = [], [0] * len(depths)
     for i in (radii > 0).all(-1).nonzero()[:, 0].tolist():
         assert image_ids[i] < images
         for y in range(first[i][1], past[i][1]):
             for x in range(first[i][0], past[i][0]):
-                found.append(((int(image_ids[i]) * rows + y) * columns + x, float(depths[i]), i))
+                pairs.append(((int(image_ids[i]) * rows + y) * columns + x, float(depths[i]), i))
                 counts[i] += 1
-    found.sort()
-    keys, _, order = zip(*found, strict=True) if found else ((), (), ())
+    pairs.sort()
+    keys, _, order = zip(*pairs, strict=True) if pairs else ((), (), ())
     return torch.tensor(counts), torch.tensor(keys, dtype=torch.int64), torch.tensor(order, dtype=torch.int32)
 
 
@@ -136,9 +137,9 @@ def _back(kernel: Callable[..., Any], given: list[Any], outputs: list[int], grad
         for each in given
     ]
     with torch.enable_grad():
-        found = kernel(*leaves)
+        results = kernel(*leaves)
         total = sum(
-            torch.where(found[index].isnan(), 0.0, found[index] * gradient.nan_to_num()).sum()
+            torch.where(results[index].isnan(), 0.0, results[index] * gradient.nan_to_num()).sum()
             for index, gradient in zip(outputs, gradients, strict=True)
         )
     wanted = [each for each in leaves if isinstance(each, Tensor) and each.requires_grad]
@@ -186,8 +187,8 @@ def _blend_back(
         return _blend(*given, backgrounds, masks, width, height, tile_size, offsets, order)  # type: ignore[arg-type]
 
     given = [part.nan_to_num() for part in (means2d, conics, colors, opacities)]
-    found = _back(blend, given, [0, 1], [by_image, by_alpha])
-    return found[0].abs() if absolute else None, found[0], found[1], found[2], found[3]
+    gradients = _back(blend, given, [0, 1], [by_image, by_alpha])
+    return gradients[0].abs() if absolute else None, gradients[0], gradients[1], gradients[2], gradients[3]
 
 
 KERNELS: dict[str, Callable[..., Any]] = {
@@ -222,8 +223,8 @@ def gsplat_on_cpu() -> Iterator[None]:
 def _harmonics_160(degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor) -> Tensor:
     """As gsplat's `spherical_harmonics` from 1.6.0 on: (c, n, 3) of means, seen by c poses."""
     centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]  # (c, 3)
-    each = [_torch_impl._spherical_harmonics(degrees_to_use, means - centre, coeffs) for centre in centres]
-    return torch.stack(each)
+    colors = [_torch_impl._spherical_harmonics(degrees_to_use, means - centre, coeffs) for centre in centres]
+    return torch.stack(colors)
 
 
 def _isect_tiles_160(
@@ -370,8 +371,8 @@ def blend_backward(
         absolute,
     )
     whole, means2d, conics, colors, opacities = _blend_back(*_parts(records), backgrounds, *rest)
-    found = torch.cat([colors, opacities[..., None], means2d, conics[..., :2]], -1)
-    return found, torch.cat([conics[..., 2:], *([] if whole is None else [whole])], -1)
+    gradients = torch.cat([colors, opacities[..., None], means2d, conics[..., :2]], -1)
+    return gradients, torch.cat([conics[..., 2:], *([] if whole is None else [whole])], -1)
 
 
 KERNEL_MODULES = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -82,12 +81,3 @@ class Blended(NamedTuple):
     def size(self) -> tuple[int, int]:
         """Return (width, height)."""
         return self.image.shape[3], self.image.shape[2]
-
-
-def records_of(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> Tensor:
-    """Return the records (c, n, RECORD) of Gaussians, (c, n, 2), (c, n, 3), (c, n, 3) and (c, n).
-
-    Training and frames have them from `kernels.project`.
-    """
-    two = torch.zeros_like(means2d)
-    return torch.cat([means2d, conics, opacities[..., None], two, colors, two[..., :1]], -1)

@@ -130,9 +130,9 @@ def files(folder: Path) -> dict[str, bytes]:
 
     TensorBoard's log, if it is installed, has another name each time, and only a recorded run has a record.
     """
-    found = sorted(path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and ".tfevents." not in path.name)
     name = str(folder).encode()
-    contents = {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in found}
+    contents = {path.relative_to(folder).as_posix(): path.read_bytes().replace(name, b"OUT") for path in paths}
     contents.pop(BARE_RECORD, None)
     return contents
 

@@ -111,7 +111,7 @@ def test_each_stage_of_our_own_trainer_gets_what_the_release_gives_it() -> None:
     settings = TrainSettings(protocol="paper")
     plan = StagePlan.create((1600, 1066), TOTAL, settings.levels, settings.shares, settings.kind)
     stages = [StageSchedule.create(settings, stage) for stage in plan]
-    found = {
+    schedules = {
         "iterations": [stage.iterations for stage in stages],
         "densify_from_iter": [stage.densify_start for stage in stages],
         "densify_until_iter": [stage.densify_until for stage in stages],
@@ -121,7 +121,7 @@ def test_each_stage_of_our_own_trainer_gets_what_the_release_gives_it() -> None:
         "position_lr_final": [stage.means_last for stage in stages],
         "lambda_dssim": [settings.ssim_weight] * 2,
     }
-    assert found == {name: pytest.approx(SCHEDULE[name]) for name in found}
+    assert schedules == {name: pytest.approx(SCHEDULE[name]) for name in schedules}
     for stage, resets in zip(stages, RESETS, strict=True):
         assert [i for i in range(1, stage.densify_until) if i % stage.reset_every == 0] == resets
         assert stage.sh_every == SH_EVERY

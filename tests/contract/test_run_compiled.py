@@ -47,15 +47,15 @@ def modules_of(script: Path, wanted: str = AUTO, *words: str, bare: bool = False
 @pytest.mark.parametrize("name", STUBS)
 def test_a_checkout_that_was_just_cloned_imports_ours(name: str) -> None:
     stub = STUBS[name]
-    found = modules_of(stub.script)
-    assert found.rasterizer == OURS
-    assert found.beside == {}
+    compiled = modules_of(stub.script)
+    assert compiled.rasterizer == OURS
+    assert compiled.beside == {}
     rasterizer = adapter_class(stub.script.parent).info.rasterizer
-    assert found.reasons.items() >= {rasterizer: "not installed", "simple_knn": "not installed"}.items()
-    assert f"{rasterizer} (not installed)" in found.describe()
-    assert "\n" not in found.describe()
+    assert compiled.reasons.items() >= {rasterizer: "not installed", "simple_knn": "not installed"}.items()
+    assert f"{rasterizer} (not installed)" in compiled.describe()
+    assert "\n" not in compiled.describe()
     before = dict(sys.modules)
-    with found.in_place():
+    with compiled.in_place():
         assert hasattr(importlib.import_module(rasterizer), "GaussianRasterizer")
         assert hasattr(importlib.import_module("simple_knn._C"), "distCUDA2")
     assert sys.modules == before
@@ -116,12 +116,12 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def test_an_installed_one_is_its_own_and_one_that_crashes_is_ours(install: Callable[..., None]) -> None:
     install("graphdeco-accel", "import os\nos.abort()\n")
-    found = modules_of(STUBS["graphdeco"].script)
-    assert found.rasterizer == OWN
-    assert found.reasons["simple_knn"].startswith("crashed")
-    assert RASTERIZER not in found.placed
+    compiled = modules_of(STUBS["graphdeco"].script)
+    assert compiled.rasterizer == OWN
+    assert compiled.reasons["simple_knn"].startswith("crashed")
+    assert RASTERIZER not in compiled.placed
     # The stub passes DC apart where sparse Adam is installed, and its sources fit a rasterizer without, too.
-    assert hasattr(found.beside[RASTERIZER], "SparseGaussianAdam")
+    assert hasattr(compiled.beside[RASTERIZER], "SparseGaussianAdam")
     ours = modules_of(STUBS["graphdeco"].script, OURS)
     assert (ours.rasterizer, ours.reasons[RASTERIZER]) == (OURS, "--rasterizer lapgs")
 
@@ -141,9 +141,9 @@ def test_ours_takes_the_place_of_one_that_lacks_what_the_checkout_passes(
     variant: str, words: tuple[str, ...], why: str, install: Callable[..., None]
 ) -> None:
     install(variant)
-    found = modules_of(STUBS["graphdeco"].script, AUTO, *words)
-    assert found.rasterizer == OURS
-    assert found.reasons == {RASTERIZER: why, "fused_ssim": "not installed"}
+    compiled = modules_of(STUBS["graphdeco"].script, AUTO, *words)
+    assert compiled.rasterizer == OURS
+    assert compiled.reasons == {RASTERIZER: why, "fused_ssim": "not installed"}
 
 
 def slower(ours: type, clock: SimpleNamespace) -> type:
@@ -204,8 +204,8 @@ def with_both(
 
 def original(stub: Stub) -> type:
     with cuda_on_cpu(stub.stand_in):
-        found: type = sys.modules[RASTERIZER].GaussianRasterizer
-    return found
+        rasterizer: type = sys.modules[RASTERIZER].GaussianRasterizer
+    return rasterizer
 
 
 def trained(
@@ -286,10 +286,12 @@ def test_a_run_that_is_continued_keeps_its_rasterizer(clock: SimpleNamespace, sc
 def test_a_checkout_without_compiled_modules_trains(scene: Path, tmp_path: Path) -> None:
     """The modules are those of a GPU; here they render on the CPU."""
     stub = STUBS["graphdeco"]
-    found, folder = modules_of(stub.script), tmp_path / "run"
+    compiled, folder = modules_of(stub.script), tmp_path / "run"
     words = arguments(stub, scene, folder, SHORT)
-    with forgetting_stubs(), cuda_on_cpu(None), found.in_place(), loaded_script(stub.script, words) as script:
-        HierarchyDriver(RunRequest(adapter_class(stub.script.parent)(script), RunSettings(), found, device="cpu")).run()
+    with forgetting_stubs(), cuda_on_cpu(None), compiled.in_place(), loaded_script(stub.script, words) as script:
+        HierarchyDriver(
+            RunRequest(adapter_class(stub.script.parent)(script), RunSettings(), compiled, device="cpu")
+        ).run()
     run = RunArchive.open(folder)
     assert run.manifest.complete
     assert run.manifest.settings[CHOICE]["taken"] == OURS
@@ -298,11 +300,11 @@ def test_a_checkout_without_compiled_modules_trains(scene: Path, tmp_path: Path)
 
 def test_a_bare_run_without_compiled_modules_says_so_in_its_record(scene: Path, tmp_path: Path) -> None:
     stub = STUBS["graphdeco"]
-    found, folder = modules_of(stub.script, bare=True), tmp_path / "run"
+    compiled, folder = modules_of(stub.script, bare=True), tmp_path / "run"
     words = arguments(stub, scene, folder, SHORT)
-    with forgetting_stubs(), cuda_on_cpu(None), found.in_place(), loaded_script(stub.script, words) as script:
-        BareRunRecorder(adapter_class(stub.script.parent)(script), "cpu", compiled=found.reasons).run()
-    assert read_bare_record(folder / BARE_RECORD)["compiled"] == found.reasons
+    with forgetting_stubs(), cuda_on_cpu(None), compiled.in_place(), loaded_script(stub.script, words) as script:
+        BareRunRecorder(adapter_class(stub.script.parent)(script), "cpu", compiled=compiled.reasons).run()
+    assert read_bare_record(folder / BARE_RECORD)["compiled"] == compiled.reasons
 
 
 @pytest.mark.gpu

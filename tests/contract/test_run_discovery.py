@@ -191,12 +191,12 @@ WINDOW = StageWindow(Stage(0, (8, 6), 20, signed=True), 10, 30, 2, 4.0, 2.0)
 
 def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: Path) -> None:
     """2DGS has no `debug_from`, Speedy-Splat `visualize_iterations`, EfficientGS `no_gui`."""
-    given: list[Any] = []
+    passed: list[Any] = []
 
     def training(
         cfg: Any, options: Any, visualize_iterations: list[int], no_gui: bool = True, args: Any = None
     ) -> None:
-        given.append((cfg, options, visualize_iterations, no_gui, args))
+        passed.append((cfg, options, visualize_iterations, no_gui, args))
 
     cfg = SimpleNamespace(source_path="scene", model_path="out", white_background=True)
     options = SimpleNamespace(iterations=30, feature_lr=0.1, densify_grad_threshold=0.2)
@@ -204,7 +204,7 @@ def test_arguments_of_training_are_known_by_their_roles(scene: Path, tmp_path: P
     with loaded(STUBS["graphdeco"], scene, tmp_path) as adapter:
         call = TrainingCall.bind(training, (cfg, options, [5, 15]), {"args": parsed})
         adapter.stage_call(call, WINDOW, "run/level_0").run()
-    ((own, changed, visualized, gui, args),) = given
+    ((own, changed, visualized, gui, args),) = passed
     assert (args.depth_pseudo_weight, args.test_iterations) == (0.0, [15]), "of a residual"
     assert (parsed.depth_pseudo_weight, parsed.test_iterations) == (0.5, [7, 25])
     assert (own.model_path, own.white_background, cfg.model_path) == ("run/level_0", False, "out")
@@ -256,8 +256,8 @@ def test_iterations_among_parsed_options_are_the_calls() -> None:
     own = call.listing(WINDOW.local).values["args"]
     assert (own.test_iterations, own.save_iterations, own.iterations) == ([15], [2, 20], 30)
     assert args.test_iterations == [7, 25], "the script's own are not changed"
-    given = call.changed(args=Namespace(iterations=30))
-    assert (given.checkpoint, given.test_iterations) == (None, ())
+    parsed = call.changed(args=Namespace(iterations=30))
+    assert (parsed.checkpoint, parsed.test_iterations) == (None, ())
 
 
 def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:
@@ -275,18 +275,18 @@ def test_a_lazy_module_may_grow_while_it_is_looked_at() -> None:
 
 
 def test_arguments_that_a_script_gathers_are_passed_on_by_name() -> None:
-    given: list[dict[str, Any]] = []
+    passed: list[dict[str, Any]] = []
 
     def training(cfg: Any, opt: Any, **more: Any) -> None:
-        given.append(more)
+        passed.append(more)
 
     def gathering(cfg: Any, opt: Any, *more: Any) -> None:
-        given.append({"more": more})
+        passed.append({"more": more})
 
     cfg, opt = SimpleNamespace(source_path="scene"), SimpleNamespace(iterations=30)
     TrainingCall.bind(training, (cfg,), {"opt": opt, "quiet": True}).changed(quiet=False).run()
     TrainingCall.bind(gathering, (cfg, opt), {}).run()
-    assert given == [{"quiet": False}, {"more": ()}]
+    assert passed == [{"quiet": False}, {"more": ()}]
     with pytest.raises(UserInputError, match=r"gathering\(\) of the script got 1 argument\(s\) in \*more"):
         TrainingCall.bind(gathering, (cfg, opt, 3), {})
 

@@ -162,17 +162,17 @@ class Points(NamedTuple):
 
 
 def test_points_of_a_residual_have_what_a_fork_has_of_points() -> None:
-    given: list[Points] = []
+    clouds: list[Points] = []
     points = Points(np.ones((7, 3)), np.ones((7, 3)), None, np.ones((7, 2), np.float32), "viridis")
     context = SimpleNamespace(adapter=None)
-    model = SimpleNamespace(create_from_pcd=lambda cloud, *others: given.append(cloud))
+    model = SimpleNamespace(create_from_pcd=lambda cloud, *others: clouds.append(cloud))
     field = some_field(5)
     stage, before = Stage(0, (8, 6), 20, signed=True), StageResult(field, None, {}, {})
     scene = SimpleNamespace(points=points, others=(1.0,))
     others: Any = dict.fromkeys(field.name for field in fields(TrainingRun))
     run = TrainingRun(**{**others, "settings": RunSettings(inherit="xyz"), "context": context, "scene": scene})
     StageModel(run, stage, before).initialise(model)
-    (cloud,) = given
+    (cloud,) = clouds
     np.testing.assert_array_equal(cloud.points, field.means.double().numpy())
     assert (cloud.colors == 0.5).all()
     assert (cloud.normals, cloud.palette) == (None, "viridis")

@@ -226,7 +226,7 @@ def test_speedy_splats_pruning_may_be_timed_before_its_kernels_are_done(
 
 
 def test_speedy_splats_scores_are_the_checkouts_and_leave_other_gradients_alone(scene: Path, tmp_path: Path) -> None:
-    found: dict[str, Tensor] = {}
+    scores: dict[str, Tensor] = {}
     reached: list[bool] = []
     with captured(tmp_path, []), loaded(FORKS["speedy"], scene, tmp_path / "run") as adapter:
         original, alone = adapter.train.score_func, adapter.replacements(lambda: True)[0].make(None)
@@ -234,18 +234,18 @@ def test_speedy_splats_scores_are_the_checkouts_and_leave_other_gradients_alone(
         def compare(train_scene: Any, gaussians: Any, pipe: Any, background: Any, ratio: float) -> None:
             view = train_scene.getTrainCameras()[0]
             for name, score in (("alone", alone), ("checkout", original)):
-                found[name] = torch.zeros_like(gaussians.get_opacity)
+                scores[name] = torch.zeros_like(gaussians.get_opacity)
                 gaussians._xyz.grad = None
                 with torch.enable_grad():
-                    score(view, gaussians, pipe, background, found[name])
+                    score(view, gaussians, pipe, background, scores[name])
                 reached.append(gaussians._xyz.grad is not None)
             raise KeyboardInterrupt
 
         adapter.train.prune = compare
         with pytest.raises(KeyboardInterrupt):
             adapter.script.run_main()
-    torch.testing.assert_close(found["alone"], found["checkout"])
-    assert found["alone"].max() > 0
+    torch.testing.assert_close(scores["alone"], scores["checkout"])
+    assert scores["alone"].max() > 0
     assert reached == [False, True]
 
 

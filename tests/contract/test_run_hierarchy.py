@@ -41,14 +41,14 @@ Run = tuple[RunArchive, Result]
 def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Run]:
     """Run a stub with two levels once; the checkout saves and reports at the end of a stage, and finished fields are
     frozen."""
-    made: dict[str, Run] = {}
+    runs: dict[str, Run] = {}
 
     def run(name: str) -> Run:
-        if name not in made:
+        if name not in runs:
             folder = tmp_path_factory.mktemp(name) / "run"
             more = ("--test_iterations", ITERATIONS, "--save_iterations", 30)
-            made[name] = run_residuals(STUBS[name], scene, folder, *more, joint=0.0)
-        return made[name]
+            runs[name] = run_residuals(STUBS[name], scene, folder, *more, joint=0.0)
+        return runs[name]
 
     return run
 

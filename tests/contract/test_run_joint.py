@@ -57,22 +57,22 @@ class FieldsAt(StageHook):
 
 
 def test_renders_of_one_colour_share_their_background() -> None:
-    given: list[Tensor] = []
+    backgrounds: list[Tensor] = []
     rendering = SimpleNamespace(captured=torch.zeros(3, 2, 2))
 
     def render(call: Any, view: Any, gaussians: Any, background: Tensor) -> None:
-        given.append(background)
+        backgrounds.append(background)
         rendering.captured = torch.zeros(3, 2, 2)
 
     adapter: Any = SimpleNamespace(render=render)
     context: Any = CheckoutContext(RunRequest(adapter, device="cpu"))
     for white, black in ((True, False), (False, False), (True, True), (True, False)):
-        with torch.inference_mode(not given):
+        with torch.inference_mode(not backgrounds):
             context.render(rendering, SimpleNamespace(white_background=white), None, None, black=black)
-    assert [background.tolist() for background in given] == [[1.0] * 3, [0.0] * 3, [0.0] * 3, [1.0] * 3]
-    assert given[0] is given[3]
-    assert given[1] is given[2]
-    assert not given[0].is_inference(), "later renders may need gradients"
+    assert [background.tolist() for background in backgrounds] == [[1.0] * 3, [0.0] * 3, [0.0] * 3, [1.0] * 3]
+    assert backgrounds[0] is backgrounds[3]
+    assert backgrounds[1] is backgrounds[2]
+    assert not backgrounds[0].is_inference(), "later renders may need gradients"
 
 
 @pytest.mark.parametrize("name", NAMES)

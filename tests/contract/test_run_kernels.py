@@ -61,7 +61,7 @@ def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.Monkey
         return ours(image, other)
 
     monkeypatch.setattr(checkout_ssim, "_our_ssim", counted)
-    found = []
+    values = []
     for on in (True, False):
         called.clear()
         archive, _ = run_hierarchy(
@@ -69,8 +69,8 @@ def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.Monkey
         )
         # Once for each iteration, and once to compare, before the first of them.
         assert len(called) == (31 if on else 0)
-        found.append(composed_psnr(archive))
-    assert found[0] == pytest.approx(found[1], abs=0.2)  # dB; worst seen 2e-4
+        values.append(composed_psnr(archive))
+    assert values[0] == pytest.approx(values[1], abs=0.2)  # dB; worst seen 2e-4
 
 
 @pytest.mark.parametrize(("name", "kind"), STUBS_AND_KINDS)

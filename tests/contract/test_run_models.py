@@ -84,11 +84,11 @@ def test_a_model_that_the_script_chooses_trains_to_the_same_field(
 
 def test_doctor_names_all_models_and_what_works_with_each(tmp_path: Path) -> None:
     script = choosing(tmp_path / "c", CHOICES["a dictionary"])
-    found = describe(script)
-    (gaussians,) = (each.detail for each in found["Checkout"] if each.name == "Gaussians")
+    findings = describe(script)
+    (gaussians,) = (each.detail for each in findings["Checkout"] if each.name == "Gaussians")
     for part in ("GaussianModel", "Chosen", "Flat", "train.py:", "gaussians = kind(dataset.sh_degree"):
         assert part in gaussians
-    laplacian = next(each for each in found["lapgs run"] if each.name == "laplacian")
+    laplacian = next(each for each in findings["lapgs run"] if each.name == "laplacian")
     assert laplacian.detail.startswith("GaussianModel: its rasterizer takes")
     assert "Flat: residuals need three scale axes; scene/gaussian_model.py:" in laplacian.detail
 
@@ -199,9 +199,9 @@ def of_finished_models(folder: Path, case: str) -> Path:
 def test_a_script_that_trains_on_a_finished_model(case: str, tmp_path: Path) -> None:
     """As SegAnyGAussians' and LangSplat's features, and the trees of hierarchical 3DGS."""
     script = of_finished_models(tmp_path / "c", case)
-    found = {each.name: each for each in describe(script)["lapgs run"]}
-    assert found["nested"].status == found["laplacian"].status == "absent"
-    assert re.search(FINISHED[case][3], found["nested"].detail)
+    findings = {each.name: each for each in describe(script)["lapgs run"]}
+    assert findings["nested"].status == findings["laplacian"].status == "absent"
+    assert re.search(FINISHED[case][3], findings["nested"].detail)
     assert "without levels" in current_folder(script.parent, has_gpu=False).detail
 
 
@@ -210,9 +210,9 @@ def test_scripts_of_finished_models_are_no_examples(tmp_path: Path) -> None:
     root = of_finished_models(tmp_path / "c", "another model is set up").parent
     (root / "train.py").rename(root / "train_features.py")
     shutil.copy(CHECKOUTS / "graphdeco" / "train.py", root / "train_scene.py")
-    found = {each.name: each for each in describe(root)["Checkout"]}
-    assert found["Training"].detail.startswith("train_scene.py:")
-    assert "calls no training_setup" in found["train_features.py"].detail
+    findings = {each.name: each for each in describe(root)["Checkout"]}
+    assert findings["Training"].detail.startswith("train_scene.py:")
+    assert "calls no training_setup" in findings["train_features.py"].detail
     assert "`lapgs run train_scene.py ...`" in current_folder(root, has_gpu=False).detail
 
 

@@ -122,19 +122,19 @@ def run_watched(name: str, scene: Path, folder: Path, *more: Any, stop: bool = F
 @pytest.fixture(scope="module")
 def run_of(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[RunArchive, Seen]]:
     """Run nested levels of a stub over white once, on a rasterizer without signed colour."""
-    made: dict[str, tuple[RunArchive, Seen]] = {}
+    runs: dict[str, tuple[RunArchive, Seen]] = {}
 
     def unasked(*_: Any, **__: Any) -> None:
         raise AssertionError("nothing is signed")
 
     def run(name: str) -> tuple[RunArchive, Seen]:
-        if name not in made:
+        if name not in runs:
             folder = tmp_path_factory.mktemp(name) / "run"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(DryRun, "color_path", unasked)
                 seen = run_watched(name, scene, folder, *WHITE)
-            made[name] = RunArchive.open(folder), seen
-        return made[name]
+            runs[name] = RunArchive.open(folder), seen
+        return runs[name]
 
     return run
 

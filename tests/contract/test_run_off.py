@@ -80,13 +80,13 @@ def symbols(adapter: Any) -> dict[tuple[str, str], Any]:
         for name, module in sys.modules.items()
         if str(getattr(module, "__file__", None) or "").startswith(str(adapter.script.path.parent))
     }
-    found = {}
+    symbols_by_module = {}
     for name, module in modules.items():
         for key, value in vars(module).items():
-            found[name, key] = value
+            symbols_by_module[name, key] = value
             if isinstance(value, type) and value.__module__ in modules:
-                found |= {(f"{name}.{key}", entry): part for entry, part in vars(value).items()}
-    return found
+                symbols_by_module |= {(f"{name}.{key}", entry): part for entry, part in vars(value).items()}
+    return symbols_by_module
 
 
 class Failing(StageHook):
@@ -133,12 +133,12 @@ def test_a_script_finds_the_modules_that_python_finds(
     """Not those beside the launcher; a program that calls us from Python keeps its own."""
     script = tmp_path / "train.py"
     script.write_text('if __name__ == "__main__":\n    pass\n')
-    found = ["/opt/bin", "/usr/lib/python"]
-    monkeypatch.setattr(sys, "path", [*found])
+    search_path = ["/opt/bin", "/usr/lib/python"]
+    monkeypatch.setattr(sys, "path", [*search_path])
     monkeypatch.setattr(sys, "argv", [launcher, "run", str(script)])
     with loaded_script(script, []):
-        assert sys.path == [str(tmp_path), *(found if "pytest" in launcher else found[1:])]
-    assert sys.path == found
+        assert sys.path == [str(tmp_path), *(search_path if "pytest" in launcher else search_path[1:])]
+    assert sys.path == search_path
 
 
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:

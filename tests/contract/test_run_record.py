@@ -74,8 +74,8 @@ def test_a_recorded_run_is_the_bare_run_to_the_bit(
     assert values["mean_gaussians"] == pytest.approx(sum(counts) / ITERATIONS)
     assert values["peak_gaussians"] >= max(*counts, values["num_gaussians"])
     assert values["saving_seconds"] > 0
-    each = PROFILED / (ITERATIONS // gpu_busy.WINDOWS)
-    assert values["gpu_busy_seconds"] == pytest.approx(each * ITERATIONS)
+    profiled_iterations = PROFILED / (ITERATIONS // gpu_busy.WINDOWS)
+    assert values["gpu_busy_seconds"] == pytest.approx(profiled_iterations * ITERATIONS)
     assert values["train_seconds"] + values["saving_seconds"] < wall
     assert values["timeline"][-1]["elapsed"] <= values["train_seconds"]
 

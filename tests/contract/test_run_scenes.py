@@ -299,9 +299,9 @@ def test_a_fork_without_an_option_for_held_out_views(scene: Path, tmp_path: Path
         extract = adapter.train.ModelParams.extract
 
         def without(group: Any, args: Any) -> Any:
-            found = extract(group, args)
-            del found.eval
-            return found
+            options = extract(group, args)
+            del options.eval
+            return options
 
         adapter.train.ModelParams.extract = without
         drive(adapter, levels=1)

@@ -163,17 +163,17 @@ def test_tamings_budget_is_shared_in_both_modes(mode: str, budget: float, scene:
         call = published_call("taming", adapter, args=args)
         stages = [adapter.stage_call(call, window, "run") for window in (BASE, FINEST)]
         count_array = sys.modules["utils.taming_utils"].get_count_array
-        found = []
+        budgets = []
         for start, stage in zip((1_000, 10_000), stages, strict=True):
-            given = stage.values["args"]
-            counts = count_array(start, given.budget, stage.opt, mode=given.mode)
+            stage_args = stage.values["args"]
+            counts = count_array(start, stage_args.budget, stage.opt, mode=stage_args.mode)
             # Densification number i looks up entry i + 1.
             times = range(stage.opt.densify_from_iter + 1, stage.opt.densify_until_iter)
             densifications = sum(i % stage.opt.densification_interval == 0 for i in times)
             assert densifications < len(counts)
             assert sorted(counts) == counts
-            found.append((given.budget, counts[-1] > 0.95 * given.budget, given.ho_iteration))
-    assert found == [(10_000, True, 15_000), (20_000, True, 15_000)]
+            budgets.append((stage_args.budget, counts[-1] > 0.95 * stage_args.budget, stage_args.ho_iteration))
+    assert budgets == [(10_000, True, 15_000), (20_000, True, 15_000)]
 
 
 def test_tamings_table_of_counts_covers_uneven_intervals(scene: Path, tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict
     text = script.read_text(encoding="utf-8")
     assert PUBLISHED in text
     script.write_text(text.replace(PUBLISHED, "iteration % 30 == 0 and iteration > 150 and iteration < 300"))
-    found: dict[str, list[tuple[int, int]]] = {"prune": [], "step": [], "sh_step": []}
+    iterations: dict[str, list[tuple[int, int]]] = {"prune": [], "step": [], "sh_step": []}
     with captured(folder, []), loaded(STUBS["fastgs"], scene, folder / "run", *more, script=script) as adapter:
         model = adapter.train.GaussianModel
         setup, prune = model.training_setup, model.final_prune_fastgs
@@ -227,31 +227,31 @@ def record_fastgs(scene: Path, folder: Path, *more: Any, **options: Any) -> dict
             setup(self, training_args)
             now[:] = [training_args.iterations, 0]
             for name, optimizer in (("step", self.optimizer), ("sh_step", self.shoptimizer)):
-                optimizer.register_step_post_hook(lambda *_, name=name: found[name].append((now[0], now[1])))
+                optimizer.register_step_post_hook(lambda *_, name=name: iterations[name].append((now[0], now[1])))
 
         def update_learning_rate(self: Any, iteration: int, update: Any = model.update_learning_rate) -> Any:
             now[1] = iteration
             return update(self, iteration)
 
         def final_prune_fastgs(self: Any, min_opacity: float, pruning_score: Any = None) -> None:
-            found["prune"].append((now[0], now[1]))
+            iterations["prune"].append((now[0], now[1]))
             assert min_opacity == 0.1
             prune(self, min_opacity, pruning_score)
 
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         model.final_prune_fastgs = final_prune_fastgs
         drive(adapter, **options)
-    return found
+    return iterations
 
 
 def test_numbers_in_the_training_function_keep_their_share_of_each_residual_stage(scene: Path, tmp_path: Path) -> None:
     """FastGS prunes late at 18,000, 21,000, 24,000 and 27,000 of 30,000 iterations. The numbers of its optimizer, which
     are in another file, stay: all iterations until 15,000 step, higher SH every 16th. A stage's last does not."""
     more = ("--iterations", 300, "--densify_until_iter", 36, "--sh_degree", 0)
-    found = record_fastgs(scene, tmp_path, *more, hierarchy="laplacian", joint=0.0, **THIRDS)
-    assert found["prune"] == [*((100, i) for i in (60, 70, 80, 90)), *((200, i) for i in (120, 140, 160, 180))]
-    assert found["step"] == [(n, i) for n in (100, 200) for i in range(1, n)]
-    assert found["sh_step"] == [(n, i) for n in (100, 200) for i in range(16, n, 16)]
+    iterations = record_fastgs(scene, tmp_path, *more, hierarchy="laplacian", joint=0.0, **THIRDS)
+    assert iterations["prune"] == [*((100, i) for i in (60, 70, 80, 90)), *((200, i) for i in (120, 140, 160, 180))]
+    assert iterations["step"] == [(n, i) for n in (100, 200) for i in range(1, n)]
+    assert iterations["sh_step"] == [(n, i) for n in (100, 200) for i in range(16, n, 16)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -273,9 +273,9 @@ def test_nested_levels_keep_the_schedule_but_for_thresholds(name: str, scene: Pa
         model.training_setup, model.update_learning_rate = training_setup, update_learning_rate
         drive(adapter, **THIRDS)
         thresholds = adapter.densify_thresholds(Namespace(**seen[10]))
-    given = {name: value for name, value in seen[11].items() if name not in thresholds}
-    assert {name: value for name, value in seen[10].items() if name not in thresholds} == given
-    assert given["iterations"] == 30
+    kept = {name: value for name, value in seen[11].items() if name not in thresholds}
+    assert {name: value for name, value in seen[10].items() if name not in thresholds} == kept
+    assert kept["iterations"] == 30
     for threshold in thresholds:
         assert seen[10][threshold] == 2 * seen[11][threshold]
 

@@ -108,8 +108,8 @@ def test_one_level_is_the_script_alone(scene: Path, tmp_path: Path) -> None:
 def test_levels_are_archived(finished: Path) -> None:
     archive = RunArchive.open(finished)
     signed = finished.name == "laplacian"
-    found = [(each.level, each.image_size, each.iterations, each.signed) for each in archive.manifest.records]
-    assert found == [(1, (32, 24), 10, False), (0, (64, 48), 20, signed)]
+    levels = [(each.level, each.image_size, each.iterations, each.signed) for each in archive.manifest.records]
+    assert levels == [(1, (32, 24), 10, False), (0, (64, 48), 20, signed)]
     assert [archive.field(level).signed for level in (1, 0)] == [False, signed]
     assert {entry["level"] for entry in archive.history() if "psnr" in entry} == {0, 1}
     gains = finest_gains(last_view_psnrs(archive.history(), along=True))
@@ -225,12 +225,12 @@ def test_poses_get_gradients_on_a_cpu() -> None:
         return (rasterization_on_cpu(**inputs, viewmats=pose)[0] * weights).sum()
 
     numbers = torch.zeros(6, requires_grad=True)
-    (found,) = torch.autograd.grad(loss(numbers), numbers)
+    (gradient,) = torch.autograd.grad(loss(numbers), numbers)
     steps = 2e-3 * torch.eye(6)
     with torch.no_grad():
         expected = torch.stack([(loss(step) - loss(-step)) / 4e-3 for step in steps])
     # Differences also see Gaussians that end or begin in pixels: 0.9994 was seen.
-    assert torch.cosine_similarity(found, expected, dim=0) > 0.99
+    assert torch.cosine_similarity(gradient, expected, dim=0) > 0.99
 
 
 @pytest.mark.parametrize("option", ["--app_opt", "--depth_loss", "--random_bkgd"])

@@ -102,9 +102,9 @@ def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
     stand_in_is_refused(
         checkout, f"lapgs has no rasterizer in place of {module}, imported in gaussian_renderer/__init_"
     )
-    (found,) = describe(checkout)["Rasterizers"]
-    assert (found.name, found.status) == (module, "ok")
-    assert found.detail.startswith("part of the checkout; ")
+    (finding,) = describe(checkout)["Rasterizers"]
+    assert (finding.name, finding.status) == (module, "ok")
+    assert finding.detail.startswith("part of the checkout; ")
 
 
 TRAIN = """\

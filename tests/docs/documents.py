@@ -56,10 +56,10 @@ def prose(document: Path) -> str:
 
 def commands(document: Path) -> list[list[str]]:
     """Return the words of every `lapgs` command in the blocks of a document."""
-    found = []
+    lines = []
     for block in blocks(document):
         for line in re.sub(r"\\\n\s*", "", block.text).splitlines():
             words = shlex.split(line, comments=True) if re.match(r"([A-Z_]+=\S+ )*lapgs ", line) else []
             if words:
-                found.append(words[words.index("lapgs") + 1 :])
-    return found
+                lines.append(words[words.index("lapgs") + 1 :])
+    return lines

@@ -79,8 +79,8 @@ def test_every_command_parses(document: Path, tmp_path: Path, monkeypatch: pytes
     config.write_text('scene = "data/garden"\n')
     for words in commands(document):
         command, context = parsed(words)
-        given = context.params
-        if words[0] in ("train", "run") and not (given.get("view") or given.get("resume") or given.get("off")):
+        params = context.params
+        if words[0] in ("train", "run") and not (params.get("view") or params.get("resume") or params.get("off")):
             with context:
                 command.invoke(context)  # makes the settings, which checks their values, and ends
 
@@ -93,12 +93,12 @@ def test_a_renamed_option_would_be_found() -> None:
 
 
 def every_option() -> set[str]:
-    found, waiting = {"--help"}, [all_commands()]
+    options, waiting = {"--help"}, [all_commands()]
     while waiting:
         command: Any = waiting.pop()
         waiting += getattr(command, "commands", {}).values()
-        found |= {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
-    return found
+        options |= {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+    return options
 
 
 @pytest.mark.parametrize("document", PAGES, ids=name_of)

@@ -50,14 +50,14 @@ def test_every_program_has_a_test() -> None:
 
 def test_a_run_is_read(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_run(Path("runs/mine"), here)
-    found = executed("read_a_run.py")
-    camera, images = found["view"].camera, found["levels"]
+    variables = executed("read_a_run.py")
+    camera, images = variables["view"].camera, variables["levels"]
     up = lapgs.Pyramid().up(images.base, (camera.height, camera.width))
     torch.testing.assert_close(images.composed[0], up + images.residuals[0], rtol=0, atol=1e-5)  # 1.2e-7 seen
-    torch.testing.assert_close(found["sharper"], up + 1.5 * images.residuals[0], rtol=0, atol=1e-5)  # 1.2e-7 seen
-    torch.testing.assert_close(found["frame"], images.image.clamp(0, 1), rtol=0, atol=1e-5)  # 0 seen
-    assert found["coarse"].image.shape == images.base.shape
-    assert torch.equal(GaussianField.load_ply("level_0.ply").means, found["field"].means)
+    torch.testing.assert_close(variables["sharper"], up + 1.5 * images.residuals[0], rtol=0, atol=1e-5)  # 1.2e-7 seen
+    torch.testing.assert_close(variables["frame"], images.image.clamp(0, 1), rtol=0, atol=1e-5)  # 0 seen
+    assert variables["coarse"].image.shape == images.base.shape
+    assert torch.equal(GaussianField.load_ply("level_0.ply").means, variables["field"].means)
     assert capsys.readouterr().out.startswith("1 (28, 20)")
 
 
@@ -116,11 +116,11 @@ def test_the_trainer_takes_a_hook_with_an_argument(
 
 
 def test_pyramids_are_used_alone() -> None:
-    found = executed("pyramids.py")
-    torch.testing.assert_close(found["composed"], found["image"], rtol=0, atol=1e-5)
-    expected = found["image"] + found["residual"]
-    torch.testing.assert_close(found["sharper"], expected, rtol=0, atol=1e-5)  # 2.4e-7 seen
-    assert found["coarse"].shape == found["base"].shape == (3, 267, 532)
+    variables = executed("pyramids.py")
+    torch.testing.assert_close(variables["composed"], variables["image"], rtol=0, atol=1e-5)
+    expected = variables["image"] + variables["residual"]
+    torch.testing.assert_close(variables["sharper"], expected, rtol=0, atol=1e-5)  # 2.4e-7 seen
+    assert variables["coarse"].shape == variables["base"].shape == (3, 267, 532)
 
 
 def test_names_on_the_page_are_names_of_the_package() -> None:

@@ -58,9 +58,9 @@ def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
 
 def test_the_reference_has_every_command_and_option(site: Path) -> None:
     page = (site / "commands.html").read_text(encoding="utf-8")
-    found = list(every_command(all_commands(), "lapgs"))
-    assert len(found) > 15
-    for words, command in found:
+    commands = list(every_command(all_commands(), "lapgs"))
+    assert len(commands) > 15
+    for words, command in commands:
         title = re.search(rf'<h2 id="[^"]*">{words}<.*?(?=<h2 |\Z)', page, re.DOTALL)
         assert title, words
         section = html.unescape(re.sub(r"<[^>]+>", "", title[0]))

@@ -43,17 +43,17 @@ def main() -> int:
 
 def campaign(fuzzer: Fuzzer, kinds: list, cases: int, seed: int) -> Counter[str]:  # type: ignore[type-arg]
     """Try cases of all kinds in turn; print each new kind of failure."""
-    found: Counter[str] = Counter()
+    failures: Counter[str] = Counter()
     for number in range(cases):
         kind = kinds[number % len(kinds)]
         case = fuzzer.draw(kind, Random(f"{kind.name} {seed} {number}"))
         problem = fuzzer.problem(case)
         if problem is None:
             continue
-        if problem.signature not in found:
+        if problem.signature not in failures:
             print(f"{kind.name}: {problem.signature}\n    {fuzzer.keep(case)}", flush=True)
-        found[problem.signature] += 1
-    return found
+        failures[problem.signature] += 1
+    return failures
 
 
 def _replay(fuzzer: Fuzzer, path: Path) -> int:

@@ -248,9 +248,9 @@ def _write_foreign(folder: Path) -> None:
 
 
 def _foreign_field(folder: Path) -> None:
-    place = folder / "point_cloud" / "iteration_30"
-    place.mkdir(parents=True)
-    blob_field(8).save_ply(place / "point_cloud.ply")
+    folder_of_ply = folder / "point_cloud" / "iteration_30"
+    folder_of_ply.mkdir(parents=True)
+    blob_field(8).save_ply(folder_of_ply / "point_cloud.ply")
 
 
 def _write_experiment(folder: Path, reader: Reader) -> None:

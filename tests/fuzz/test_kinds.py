@@ -55,8 +55,8 @@ def test_damaged_files_are_refused_in_a_line(fuzzer: Fuzzer, kind: Kind, random:
 def test_a_long_campaign(fuzzer: Fuzzer) -> None:
     seed = time.time_ns() % 2**32
     print(f"seed {seed}")
-    found = campaign(replace(fuzzer, slow=True), list(KINDS), MANY_CASES, seed)
-    assert not found
+    failures = campaign(replace(fuzzer, slow=True), list(KINDS), MANY_CASES, seed)
+    assert not failures
 
 
 # ----------------------------------------------------------------------------------------------------------- harness

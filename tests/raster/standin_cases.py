@@ -95,32 +95,32 @@ def covariances(inputs: dict[str, Tensor]) -> Tensor:
 def outputs(module: ModuleType, variant: str, name: str, inputs: dict[str, Tensor], device: str) -> dict[str, Tensor]:
     """Return the results of a case, on the CPU: `out0` ... in the module's order, and `grad_` of each input."""
     case = CASES[name]
-    given = {key: value.to(device) for key, value in inputs.items()}
+    on_device = {key: value.to(device) for key, value in inputs.items()}
     values: dict[str, Any] = {
         "image_height": HEIGHT, "image_width": WIDTH, "tanfovx": TAN_X, "tanfovy": TAN_X * HEIGHT / WIDTH,
-        "bg": torch.tensor(case.background, device=device), "scale_modifier": 1.0, "viewmatrix": given["view"],
-        "projmatrix": given["full"], "sh_degree": signed_degree(case.degree) if case.signed else case.degree,
-        "campos": given["position"], "prefiltered": False, "debug": False, "mult": 1.0, "get_flag": True,
-        "metric_map": (given["pixel_weights"] < 0.4).int(), "antialiasing": False,
-        "pixel_weights": given["pixel_weights"],
+        "bg": torch.tensor(case.background, device=device), "scale_modifier": 1.0, "viewmatrix": on_device["view"],
+        "projmatrix": on_device["full"], "sh_degree": signed_degree(case.degree) if case.signed else case.degree,
+        "campos": on_device["position"], "prefiltered": False, "debug": False, "mult": 1.0, "get_flag": True,
+        "metric_map": (on_device["pixel_weights"] < 0.4).int(), "antialiasing": False,
+        "pixel_weights": on_device["pixel_weights"],
     }  # fmt: skip
     fields = module.GaussianRasterizationSettings._fields
     settings = module.GaussianRasterizationSettings(**{key: (values | case.options)[key] for key in fields})
     points = torch.zeros(GAUSSIANS, 4 if variant == "fastgs" else 3, device=device)
-    leaves = {"means3D": given["means"], "means2D": points, "opacities": given["opacities"]}
+    leaves = {"means3D": on_device["means"], "means2D": points, "opacities": on_device["opacities"]}
     if case.precomputed:
-        leaves |= {"colors_precomp": given["colors"], "cov3D_precomp": covariances(given)}
+        leaves |= {"colors_precomp": on_device["colors"], "cov3D_precomp": covariances(on_device)}
     else:
-        leaves |= {"scales": given["scales"], "rotations": given["quats"]}
-        split = {"dc": given["sh"][:, :1].contiguous(), "shs": given["sh"][:, 1:].contiguous()}
-        leaves |= split if variant in SPLIT else {"shs": given["sh"]}
+        leaves |= {"scales": on_device["scales"], "rotations": on_device["quats"]}
+        split = {"dc": on_device["sh"][:, :1].contiguous(), "shs": on_device["sh"][:, 1:].contiguous()}
+        leaves |= split if variant in SPLIT else {"shs": on_device["sh"]}
     leaves = {key: value.detach().requires_grad_() for key, value in leaves.items()}
-    found = module.GaussianRasterizer(settings)(**leaves)
-    record = {f"out{i}": tensor.detach().cpu() for i, tensor in enumerate(found)}
+    results = module.GaussianRasterizer(settings)(**leaves)
+    record = {f"out{i}": tensor.detach().cpu() for i, tensor in enumerate(results)}
     if variant not in WITHOUT_GRADIENTS:
-        loss = (found[0] * given["weights"][:3]).sum()
+        loss = (results[0] * on_device["weights"][:3]).sum()
         if variant == "graphdeco-aa":
-            loss = loss + (found[2] * given["weights"][3:]).sum()
+            loss = loss + (results[2] * on_device["weights"][3:]).sum()
         loss.backward()
         for key, leaf in leaves.items():
             assert leaf.grad is not None, key

@@ -64,8 +64,8 @@ def call(module: ModuleType, variant: str, case: Case, inputs: dict[str, Tensor]
     if variant in SPLIT and "shs" in inputs:
         shs = inputs.pop("shs")
         inputs.update(dc=shs[:, :1], shs=shs[:, 1:])
-    found: tuple[Tensor, ...] = module.GaussianRasterizer(settings)(means2D=points, **inputs)
-    return (*found, points)
+    results: tuple[Tensor, ...] = module.GaussianRasterizer(settings)(means2D=points, **inputs)
+    return (*results, points)
 
 
 def module_of(variant: str) -> ModuleType:
@@ -118,14 +118,14 @@ def least_distance(conic: Tensor, centre: Tensor, tile: Tensor) -> float:
     if bool(((low <= 0) & (high >= 0)).all()):
         return 0.0
     xx, xy, yy = conic.tolist()
-    found = []
+    distances = []
     for x in (float(low[0]), float(high[0])):
         y = min(max(-xy * x / yy, float(low[1])), float(high[1]))
-        found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+        distances.append(xx * x * x + 2 * xy * x * y + yy * y * y)
     for y in (float(low[1]), float(high[1])):
         x = min(max(-xy * y / xx, float(low[0])), float(high[0]))
-        found.append(xx * x * x + 2 * xy * x * y + yy * y * y)
-    return min(found)
+        distances.append(xx * x * x + 2 * xy * x * y + yy * y * y)
+    return min(distances)
 
 
 def brute_force(case: Case, mult: float, marked: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
@@ -197,8 +197,8 @@ def test_fastgs_without_the_flag_counts_nothing() -> None:
 def test_taming_sums_over_pixels() -> None:
     case = case_of(n=50)
     weights = torch.rand(41, 53, generator=torch.Generator().manual_seed(3))
-    found = call(module_of("taming"), "taming", case, activated(case), pixel_weights=weights)
-    image, radii, counts, *lists, centres, depths, again, weighted, pixels, blending, distances, _ = found
+    results = call(module_of("taming"), "taming", case, activated(case), pixel_weights=weights)
+    image, radii, counts, *lists, centres, depths, again, weighted, pixels, blending, distances, _ = results
     _, _, sums = brute_force(case, 100.0, weights.double())  # all tiles
     shown = call(module_of("graphdeco"), "graphdeco", case, activated(case))
     seen = project(case.to(torch.float64).field, case.to(torch.float64).camera)
@@ -223,10 +223,10 @@ def test_taming_sums_over_pixels() -> None:
 def test_taming_without_two_rows_of_weights_gives_empty_sums(rows: int | None) -> None:
     case = case_of(n=5)
     weights = None if rows is None else torch.ones(rows, 41, 53)
-    found = call(module_of("taming"), "taming", case, activated(case), pixel_weights=weights)
-    assert len(found) == 13 + 1
-    assert [t.numel() for t in found[9:13]] == [0, 0, 0, 0]
-    assert found[2].shape == ((41, 53) if rows == 1 else (0,))
+    results = call(module_of("taming"), "taming", case, activated(case), pixel_weights=weights)
+    assert len(results) == 13 + 1
+    assert [t.numel() for t in results[9:13]] == [0, 0, 0, 0]
+    assert results[2].shape == ((41, 53) if rows == 1 else (0,))
 
 
 # ------------------------------------------------------------------------ given covariances and colours, antialiasing
@@ -339,9 +339,9 @@ def test_scale_modifier_multiplies_scales_but_not_their_gradient() -> None:
 def test_a_training_loop_written_for_the_cuda_module_learns(variant: str) -> None:
     """Call like a checkout's train.py: render, SSIM, densification statistics, optimizer."""
     case = case_of(sh_degree=1, n=80)
-    with install(variant) as found, torch.no_grad():
-        module = found[VARIANTS[variant].module]
-        fused_ssim = found["fused_ssim"].fused_ssim
+    with install(variant) as modules, torch.no_grad():
+        module = modules[VARIANTS[variant].module]
+        fused_ssim = modules["fused_ssim"].fused_ssim
         target = call(module, variant, case, activated(case))[0]
         start = case.field.with_parameters({"sh": torch.zeros_like(case.field.sh)})
         student = replace(case, field=start).with_leaves()
@@ -400,13 +400,13 @@ def test_arguments_that_do_not_fit_are_refused() -> None:
 
 def test_install_is_undone_and_refuses_to_replace() -> None:
     before = dict(sys.modules)
-    with install("taming-rasterizer") as found:
+    with install("taming-rasterizer") as modules:
         import diff_gaussian_rasterization
         from diff_gaussian_rasterization._C import fusedssim
         from fused_ssim import fused_ssim
         from simple_knn._C import distCUDA2
 
-        assert diff_gaussian_rasterization is found["diff_gaussian_rasterization"]
+        assert diff_gaussian_rasterization is modules["diff_gaussian_rasterization"]
         assert diff_gaussian_rasterization.SparseGaussianAdam
         assert callable(fusedssim)
         assert callable(fused_ssim)
@@ -470,8 +470,8 @@ def test_distances_to_three_neighbours() -> None:
     points = torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
     points[7] = points[3]  # a double is a neighbour at distance 0
     squared = torch.cdist(points.double(), points.double()).square().fill_diagonal_(torch.inf)
-    found = stand_ins("taming")["simple_knn._C"].distCUDA2(points)
-    assert relative(found, squared.topk(3, largest=False).values.mean(1)) < 1e-6  # worst seen: 2.8e-8
+    distances = stand_ins("taming")["simple_knn._C"].distCUDA2(points)
+    assert relative(distances, squared.topk(3, largest=False).values.mean(1)) < 1e-6  # worst seen: 2.8e-8
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])

@@ -44,11 +44,11 @@ def assert_close(actual: Tensor, expected: Tensor, name: str, bound: float) -> N
 @pytest.mark.parametrize("variant", BACKBONES)
 def test_rasterizer_returns_what_its_cuda_module_does(variant: str, case: str) -> None:
     module = stand_ins(variant)[VARIANTS[variant].module]
-    found = outputs(module, variant, case, load("inputs"), "cpu")
+    results = outputs(module, variant, case, load("inputs"), "cpu")
     recorded = {key.split("/")[1]: value for key, value in load(variant).items() if key.startswith(f"{case}/")}
-    assert found.keys() == recorded.keys()
+    assert results.keys() == recorded.keys()
     for key, expected in recorded.items():
-        assert_close(found[key], expected, key, GRADIENT_BOUND if key.startswith("grad_") else OUTPUT_BOUND)
+        assert_close(results[key], expected, key, GRADIENT_BOUND if key.startswith("grad_") else OUTPUT_BOUND)
 
 
 def test_neighbours_and_ssim_return_what_their_cuda_modules_do() -> None:

@@ -111,17 +111,17 @@ def test_mini_splatting_finds_points_where_rays_come_nearest() -> None:
     module = module_of("mini-splatting")
     settings = settings_of(module, case.camera, (0.0, 0.0, 0.0), 3)
     with torch.no_grad():
-        found = module.GaussianRasterizer(settings).render_depth(
+        results = module.GaussianRasterizer(settings).render_depth(
             means2D=torch.zeros(40, 3), **(arguments | {"scales": scale})
         )
-    points, at = found["out_pts"].flatten(1).T, found["gidx"].flatten().long()
+    points, at = results["out_pts"].flatten(1).T, results["gidx"].flatten().long()
     seen = points.abs().sum(1) > 0
     ray = normalize(points - settings.campos, dim=1)
     to_centre = arguments["means3D"][at] - points
     assert int(seen.sum()) > 200
     assert ((ray * to_centre).sum(1).abs() / to_centre.norm(dim=1))[seen].max() < 1e-3  # 1e-5 seen
-    assert found["accum_alpha"].min() >= 0
-    assert found["accum_alpha"].max() <= 1
+    assert results["accum_alpha"].min() >= 0
+    assert results["accum_alpha"].max() <= 1
 
 
 def test_absgs_returns_shares_and_absolute_gradients() -> None:
@@ -140,17 +140,17 @@ def test_absgs_returns_shares_and_absolute_gradients() -> None:
 def test_pixel_gs_counts_pixels_and_scales_screen_gradients_by_depth() -> None:
     case = small_case()
     expected = call(module_of("graphdeco"), "graphdeco", case, activated(case))
-    found = call(module_of("pixel-gs"), "pixel-gs", case, activated(case), depth_threshold=4.0)
-    assert torch.equal(found[0], expected[0])
-    for image, points in ((expected[0], expected[-1]), (found[0], found[-1])):
+    results = call(module_of("pixel-gs"), "pixel-gs", case, activated(case), depth_threshold=4.0)
+    assert torch.equal(results[0], expected[0])
+    for image, points in ((expected[0], expected[-1]), (results[0], results[-1])):
         image.sum().backward(inputs=[points])
     pose = case.camera.world_to_camera
     depths = case.field.means.detach() @ pose[2, :3] + pose[2, 3]
     assert 0 < int((depths < 4).sum()) < 40
     scaled = expected[-1].grad * (depths / 4).square().clamp(max=1)[:, None]
-    torch.testing.assert_close(found[-1].grad, scaled, rtol=1e-5, atol=1e-6)  # 0 seen
+    torch.testing.assert_close(results[-1].grad, scaled, rtol=1e-5, atol=1e-6)  # 0 seen
     shares, _ = blended(case)
-    assert (found[2][:, 0] - (shares > 0).sum((1, 2))).abs().max() <= 1  # alpha of a pixel may be at 1/255
+    assert (results[2][:, 0] - (shares > 0).sum((1, 2))).abs().max() <= 1  # alpha of a pixel may be at 1/255
 
 
 def test_mip_splatting_dims_as_graphdeco_does_and_sums_absolute_gradients() -> None:
@@ -179,9 +179,9 @@ def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
     more: dict[str, Any] = {"use_train_speedup": False, "ignored_rate": 0.0, "lambda_dssim": 0.2, "use_hwc": True}
     degrees = torch.arange(40, dtype=torch.int32) % 4
     loss = torch.rand(3, 41, 53, generator=torch.Generator().manual_seed(0))
-    given = {"gt_image": None, "sparse_shs_degree": degrees, "pix_loss": loss, "top_k": 1}
+    options = {"gt_image": None, "sparse_shs_degree": degrees, "pix_loss": loss, "top_k": 1}
     with torch.no_grad():
-        image, _, largest, _, _, losses, *_ = call(module, "efficientgs", case, activated(case) | given, **more)
+        image, _, largest, _, _, losses, *_ = call(module, "efficientgs", case, activated(case) | options, **more)
         kept = activated(case)
         for i, degree in enumerate(degrees.tolist()):
             kept["shs"][i, (degree + 1) ** 2 :] = 0
@@ -195,14 +195,14 @@ def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
 
 def test_surfels_are_flat_gaussians_with_depths_and_normals() -> None:
     case = small_case()
-    given = activated(case)
+    inputs = activated(case)
     module = module_of("2dgs")
     settings = settings_of(module, case.camera, case.background, 3)
     image, radii, maps = module.GaussianRasterizer(settings)(
-        means2D=torch.zeros(40, 3), **(given | {"scales": given["scales"][:, :2].contiguous()})
+        means2D=torch.zeros(40, 3), **(inputs | {"scales": inputs["scales"][:, :2].contiguous()})
     )
-    flat = torch.cat([given["scales"][:, :2], given["scales"][:, :2].max(1, keepdim=True).values * 1e-4], 1)
-    expected = call(module_of("graphdeco"), "graphdeco", case, given | {"scales": flat})[0]
+    flat = torch.cat([inputs["scales"][:, :2], inputs["scales"][:, :2].max(1, keepdim=True).values * 1e-4], 1)
+    expected = call(module_of("graphdeco"), "graphdeco", case, inputs | {"scales": flat})[0]
     assert torch.equal(image, expected)
     assert maps.shape == (7, 41, 53)
     seen = maps[1] > 0.5
@@ -214,13 +214,13 @@ def test_surfels_are_flat_gaussians_with_depths_and_normals() -> None:
 def test_gradients_of_surfels_are_finite_where_nothing_is_blended() -> None:
     """The checkout divides the depth by alpha and replaces NaN, whose gradient stays NaN in empty pixels."""
     case = small_case()
-    given = activated(case)
-    means = given["means3D"].detach().clone().requires_grad_()
+    inputs = activated(case)
+    means = inputs["means3D"].detach().clone().requires_grad_()
     module = module_of("2dgs")
     settings = settings_of(module, case.camera, case.background, 3)
-    scales = (given["scales"][:, :2] / 4).contiguous()  # small ones leave gaps
+    scales = (inputs["scales"][:, :2] / 4).contiguous()  # small ones leave gaps
     _, _, maps = module.GaussianRasterizer(settings)(
-        means2D=torch.zeros(40, 3), **(given | {"means3D": means, "scales": scales})
+        means2D=torch.zeros(40, 3), **(inputs | {"means3D": means, "scales": scales})
     )
     assert bool((maps[1] == 0).any())
     above: list[Tensor] = []
@@ -238,13 +238,13 @@ def test_relocated_copies_have_the_opacity_and_the_light_of_one(copies: int) -> 
     """Equation 9: n copies of opacity 1 - (1 - o)^(1/n) cover what one covered; one copy stays as it is."""
     opacity, scale = torch.tensor([[0.3], [0.9]]), torch.tensor([[1.0, 2, 3], [0.1, 0.1, 0.2]])
     binoms = torch.tensor([[float(math.comb(n, k)) for k in range(51)] for n in range(51)])
-    found, scales = compute_relocation(opacity, scale, torch.full((2, 1), copies), binoms, 51)
-    torch.testing.assert_close(1 - (1 - found) ** copies, opacity)
+    opacities, scales = compute_relocation(opacity, scale, torch.full((2, 1), copies), binoms, 51)
+    torch.testing.assert_close(1 - (1 - opacities) ** copies, opacity)
     # Along a ray the light of n copies, integrated over a line, is that of the one.
     x = torch.linspace(-20, 20, 40001, dtype=torch.float64)
     for i in range(2):
         ratio = float(scales[i, 0] / scale[i, 0])
-        light = (1 - (1 - found[i].double() * torch.exp(-((x / ratio) ** 2) / 2)) ** copies).sum()
+        light = (1 - (1 - opacities[i].double() * torch.exp(-((x / ratio) ** 2) / 2)) ** copies).sum()
         torch.testing.assert_close(light, (opacity[i].double() * torch.exp(-(x**2) / 2)).sum(), rtol=1e-5, atol=0)
 
 

@@ -32,20 +32,20 @@ def names_in(source: str) -> Iterator[tuple[int, str]]:
 
 def modules() -> list[Path]:
     """Modules of the packages that may name no backbone, or only their own."""
-    found = [path.relative_to(ROOT) for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    return [path for path in found if not any(path.is_relative_to(folder) for folder in EXCEPTIONS)]
+    paths = [path.relative_to(ROOT) for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+    return [path for path in paths if not any(path.is_relative_to(folder) for folder in EXCEPTIONS)]
 
 
 def test_no_module_names_a_backbone_that_is_not_its_own() -> None:
     own = {Path("lapgs_plugin/adapters", f"{name}.py") for name in OWN}
     assert len(own) == 8
-    found = {
+    mentions = {
         f"{path}:{line}: {text}"
         for path in modules()
         if path not in own
         for line, text in names_in((ROOT / path).read_text(encoding="utf-8"))
     }
-    assert found == set()
+    assert mentions == set()
 
 
 @pytest.mark.parametrize(

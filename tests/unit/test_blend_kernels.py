@@ -12,7 +12,7 @@ import pytest
 CHECKS = """
 import torch
 from lapgs_plugin.gpu_raster.blend_kernels import Shape, blend_backward, blend_forward
-from lapgs_plugin.gpu_raster.records import records_of
+from tests.gaussian_records import records_of
 
 def blended(means, conics, colors, opacities, background, offsets, flat, height, width):
     # Every pixel blends the pairs of its tile, in order.

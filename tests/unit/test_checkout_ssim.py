@@ -34,9 +34,9 @@ class Convolved:
         mean1, mean2 = mean(img1), mean(img2)
         variances = mean(img1 * img1) - mean1**2 + mean(img2 * img2) - mean2**2
         covariance = mean(img1 * img2) - mean1 * mean2
-        found = (2 * mean1 * mean2 + 1e-4) * (2 * covariance + 9e-4)
-        found = found / ((mean1**2 + mean2**2 + 1e-4) * (variances + 9e-4))
-        return found.mean() if size_average else found.mean(1).mean(1).mean(1)
+        quotient = (2 * mean1 * mean2 + 1e-4) * (2 * covariance + 9e-4)
+        quotient = quotient / ((mean1**2 + mean2**2 + 1e-4) * (variances + 9e-4))
+        return quotient.mean() if size_average else quotient.mean(1).mean(1).mean(1)
 
 
 def replacement(convolved: Convolved) -> Callable[..., Tensor]:
@@ -80,11 +80,11 @@ def test_it_is_the_same(shape: tuple[int, ...], device: str) -> None:
 def test_what_the_checkouts_own_function_computes(call: Callable[..., Tensor]) -> None:
     convolved = Convolved()
     image, other = images(3, 21, 34)
-    found = call(replacement(convolved), image, other)
+    value = call(replacement(convolved), image, other)
     assert convolved.calls == 1
     expected = call(convolved.ssim, image, other)
-    assert found == expected
-    torch.testing.assert_close(*(torch.autograd.grad(each, image)[0] for each in (found, expected)), rtol=0, atol=0)
+    assert value == expected
+    torch.testing.assert_close(*(torch.autograd.grad(each, image)[0] for each in (value, expected)), rtol=0, atol=0)
 
 
 def other_window(img1: Tensor, img2: Tensor) -> Tensor:

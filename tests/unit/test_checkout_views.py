@@ -145,8 +145,8 @@ def test_an_image_of_other_colours_than_the_models_is_left_as_it_is(signed: bool
 
     @wrapper.renderer
     def render(viewpoint: Any, override_color: Tensor | None = None) -> Tensor:
-        made = settings(3, 4, torch.zeros(3), torch.eye(4))
-        image: Tensor = function(means, own if override_color is None else override_color, made)[1]
+        raster_settings = settings(3, 4, torch.zeros(3), torch.eye(4))
+        image: Tensor = function(means, own if override_color is None else override_color, raster_settings)[1]
         return image
 
     scores = torch.full((2, 3), 0.5)
@@ -176,24 +176,24 @@ def test_maps_beside_a_residuals_image_are_not_trained_on(signed: bool) -> None:
 
     def forward(means: Tensor, shs: Tensor, rasterizer_settings: Settings) -> dict[str, Tensor]:
         size = rasterizer_settings.image_height, rasterizer_settings.image_width
-        found = {"radii": (3,), "image": (3, *size), "depth": size, "normals": (*size, 3), "features": (16, *size)}
-        return {name: means.mean().expand(shape) * 1 for name, shape in found.items()}
+        outputs = {"radii": (3,), "image": (3, *size), "depth": size, "normals": (*size, 3), "features": (16, *size)}
+        return {name: means.mean().expand(shape) * 1 for name, shape in outputs.items()}
 
     function = wrapper.wrap_function(forward)
 
     @wrapper.renderer
     def render(viewpoint: Any) -> dict[str, Tensor]:
-        found: dict[str, Tensor] = function(means, torch.ones(2, 1, 3), settings(3, 4, torch.zeros(3), torch.eye(4)))
-        return found
+        outputs: dict[str, Tensor] = function(means, torch.ones(2, 1, 3), settings(3, 4, torch.zeros(3), torch.eye(4)))
+        return outputs
 
-    found = render(make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4)))
-    (found["image"].sum() + found["radii"].sum() + 0 * found["depth"].sum()).backward(retain_graph=True)
+    outputs = render(make_level_view(camera, (4, 3), lambda: torch.zeros(3, 3, 4)))
+    (outputs["image"].sum() + outputs["radii"].sum() + 0 * outputs["depth"].sum()).backward(retain_graph=True)
     for name in ("depth", "normals", "features"):
         refused = pytest.raises(
             UserInputError, match=r"test_checkout_views.py:\d+: the loop trains on an image of other"
         )
         with refused if signed else nullcontext():
-            found[name].sum().backward(retain_graph=True)
+            outputs[name].sum().backward(retain_graph=True)
 
 
 @pytest.mark.parametrize(("model", "first"), [("sh", "image"), ("sh", "depths"), ("colors", "image")])
@@ -217,8 +217,8 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
     @wrapper.renderer
     def render(viewpoint: Any) -> dict[str, Tensor]:
         made, means = settings(3, 4, torch.zeros(3), torch.eye(4)), torch.zeros(2, 3, requires_grad=True)
-        given = {"sh": (torch.full((2, 1, 3), 0.125), None), "colors": (None, torch.full((2, 3), 0.125))}[model]
-        calls = {"image": given, "depths": (None, torch.full((2, 3), 0.5))}
+        model_colors = {"sh": (torch.full((2, 1, 3), 0.125), None), "colors": (None, torch.full((2, 3), 0.125))}[model]
+        calls = {"image": model_colors, "depths": (None, torch.full((2, 3), 0.5))}
         order = ("image", "depths") if first == "image" else ("depths", "image")
         return {name: function(means, *calls[name], made)[1] for name in order}
 
@@ -226,13 +226,13 @@ def test_other_values_that_a_renderer_rasterizes_beside_the_image_are_left_as_th
         # It is known from the probe of signed colour on, in every later stage, that this renderer passes on SH.
         with stages.rendering_as(StageRendering(True, ColorPath.NATIVE, {}, capture=True)):
             render(view)
-    found = render(view)
+    outputs = render(view)
     assert rendering.captured is not None
-    assert found["image"].unique().tolist() == rendering.captured.image.unique().tolist() == [0.375]
-    assert found["depths"].unique().tolist() == [0.5]
-    found["image"].sum().backward()
+    assert outputs["image"].unique().tolist() == rendering.captured.image.unique().tolist() == [0.375]
+    assert outputs["depths"].unique().tolist() == [0.5]
+    outputs["image"].sum().backward()
     with pytest.raises(UserInputError, match="other colours than the model's"):
-        found["depths"].sum().backward()
+        outputs["depths"].sum().backward()
     assert not caplog.records
     rendering.capture, rendering.images = False, SimpleNamespace(targets=None, weights=None, coarse=None)
     render(view), render(view)
@@ -269,10 +269,10 @@ def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo(
     rendering: Any = stages.rendering
     below, read = rendering.accumulated, []
     rendering.accumulated = SimpleNamespace(get=lambda key: read.append(key) or below.get(key))
-    place = camera.world_view_transform
-    assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), place))[1].unique().tolist() == [0.75]
+    matrix = camera.world_view_transform
+    assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), matrix))[1].unique().tolist() == [0.75]
     assert read == [images.key(camera)]
-    assert function(torch.zeros(2, 3), settings(6, 8, torch.ones(3), place))[1].unique().tolist() == [GREY]
+    assert function(torch.zeros(2, 3), settings(6, 8, torch.ones(3), matrix))[1].unique().tolist() == [GREY]
 
 
 class WithProjection(NamedTuple):
@@ -350,10 +350,10 @@ def test_an_image_is_the_first_three_of_more_channels(leading: tuple[int, ...]) 
 
     means, function = torch.zeros(2, 3, requires_grad=True), wrapper.wrap_function(forward)
     render = wrapper.renderer(lambda view: function(means, settings(3, 4, torch.ones(3), torch.eye(4)))[0])
-    found = render(camera)
-    assert found.shape == (*leading, 5, 3, 4)
-    assert found.amax((-1, -2)).flatten().tolist() == [0.25, 1.25, 2.25, 3, 4], "Up(coarse) is added to colours alone"
-    found[..., :3, :, :].sum().backward(retain_graph=True)
-    (found[..., 3, :, :] * 0).sum().backward(retain_graph=True)  # a loss that has no weight yet
+    image = render(camera)
+    assert image.shape == (*leading, 5, 3, 4)
+    assert image.amax((-1, -2)).flatten().tolist() == [0.25, 1.25, 2.25, 3, 4], "Up(coarse) is added to colours alone"
+    image[..., :3, :, :].sum().backward(retain_graph=True)
+    (image[..., 3, :, :] * 0).sum().backward(retain_graph=True)  # a loss that has no weight yet
     with pytest.raises(UserInputError, match="other colours than the model's"):
-        found[..., 3, :, :].sum().backward()
+        image[..., 3, :, :].sum().backward()

@@ -319,8 +319,8 @@ def test_exit_code_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_json(monkeypatch: pytest.MonkeyPatch) -> None:
     code, output = run(monkeypatch, ["--json"], ("broken",))
     assert code == 1
-    found = json.loads(output)["oracle"]
-    assert [item["problems"] for item in found] == [["broken"]] * 2
+    outcomes = json.loads(output)["oracle"]
+    assert [item["problems"] for item in outcomes] == [["broken"]] * 2
 
 
 def test_an_unknown_rasterizer_is_named_with_those_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,6 +329,6 @@ def test_an_unknown_rasterizer_is_named_with_those_there_are(monkeypatch: pytest
 
 
 def test_this_machine_reaches_the_cpu_rasterizers() -> None:
-    found = command.reachable()
-    assert [subject.dtype for subject in found["cpu"]()] == [torch.float32, torch.float64]
-    assert found["oracle"]()[0].dtype == torch.float32
+    reachable = command.reachable()
+    assert [subject.dtype for subject in reachable["cpu"]()] == [torch.float32, torch.float64]
+    assert reachable["oracle"]()[0].dtype == torch.float32

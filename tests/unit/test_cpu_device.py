@@ -49,7 +49,7 @@ def test_threads_that_are_started_inside_name_devices_too() -> None:
 def test_every_way_to_name_a_device_means_the_cpu(device: Any) -> None:
     with cuda_on_cpu("fastgs"):
         ones = torch.ones(2, 3, device=device)
-        made = [
+        tensors = [
             ones,
             torch.tensor([1.0], device=device),
             torch.rand(3, device=device),
@@ -67,7 +67,7 @@ def test_every_way_to_name_a_device_means_the_cpu(device: Any) -> None:
             nn.Linear(2, 3).to(device).weight,
             nn.Linear(2, 3).cuda().bias,
         ]
-        assert all(on_cpu(tensor) for tensor in made)
+        assert all(on_cpu(tensor) for tensor in tensors)
         assert ones.to(device, torch.float64).dtype == torch.float64
 
 
@@ -103,8 +103,8 @@ def test_every_factory_of_torch_takes_cuda() -> None:
     assert len(tried) >= 25  # 34 of 43 in torch 2.13; the others take uncommon arguments
     with cuda_on_cpu("graphdeco"):
         for function, given in tried.items():
-            made = function(*given, device="cuda")
-            assert made.device.type == "cpu", function
+            tensor = function(*given, device="cuda")
+            assert tensor.device.type == "cpu", function
 
 
 def test_numbers_are_devices_only_where_torch_takes_them_for_such() -> None:
@@ -187,14 +187,14 @@ def test_same_random_numbers_as_without() -> None:
 
 def state() -> dict[str, Any]:
     """Return all state that the context changes: modules, names of torch and torch.cuda, and torch's modes."""
-    found = {f"torch.cuda.{name}": value for name, value in vars(torch.cuda).items()}
-    found |= {f"torch.autograd.{name}": value for name, value in vars(torch.autograd).items()}
-    found |= {f"torch.{name}": value for name, value in vars(torch).items()}
-    found |= {f"Tensor.{name}": value for name, value in vars(Tensor).items()}
-    found |= {f"Module.{name}": value for name, value in vars(nn.Module).items()}
-    found |= {f"sys.modules {name}": module for name, module in sys.modules.items()}
-    found["modes"] = torch._C._len_torch_function_stack()
-    return found
+    symbols = {f"torch.cuda.{name}": value for name, value in vars(torch.cuda).items()}
+    symbols |= {f"torch.autograd.{name}": value for name, value in vars(torch.autograd).items()}
+    symbols |= {f"torch.{name}": value for name, value in vars(torch).items()}
+    symbols |= {f"Tensor.{name}": value for name, value in vars(Tensor).items()}
+    symbols |= {f"Module.{name}": value for name, value in vars(nn.Module).items()}
+    symbols |= {f"sys.modules {name}": module for name, module in sys.modules.items()}
+    symbols["modes"] = torch._C._len_torch_function_stack()
+    return symbols
 
 
 def test_everything_is_restored_by_identity(monkeypatch: pytest.MonkeyPatch) -> None:

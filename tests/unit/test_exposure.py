@@ -124,12 +124,12 @@ def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_
 
 
 def test_compensation_beats_none_where_exposure_changes_and_is_left_out_where_it_does_not(tmp_path: Path) -> None:
-    found = {}
+    psnrs = {}
     for choice in ("on", "off"):
         archive = train(tmp_path / choice, wall_scene(STOPS), TrainSettings(iterations=200, exposure=choice, levels=1))
         assert (archive.exposure(0) is None) == (choice == "off")
-        found[choice] = archive.history()[-1]["loss"]
-    assert found["on"] < 0.8 * found["off"]  # worst seen 0.6 of it
+        psnrs[choice] = archive.history()[-1]["loss"]
+    assert psnrs["on"] < 0.8 * psnrs["off"]  # worst seen 0.6 of it
     archive = train(tmp_path / "auto", wall_scene((0.0,) * 6), TrainSettings(iterations=12))
     assert archive.exposure(0) is None
     archive = train(tmp_path / "changing", wall_scene(STOPS), TrainSettings(iterations=12))
@@ -212,9 +212,9 @@ def test_several_views_are_transformed_as_each_is() -> None:
     exposures = ViewExposures.create(names, from_gains(0.3 * random_image(2)[0, :3, :3]), torch.device("cpu"), 0, 1)
     together = exposures.apply(["c", "a"], images)
     (by_all,) = torch.autograd.grad(together.square().mean(), exposures.transforms)
-    each = [exposures.apply([name], image) for name, image in zip(["c", "a"], images, strict=True)]
-    (by_each,) = torch.autograd.grad(torch.stack(each).square().mean(), exposures.transforms)
-    torch.testing.assert_close(together, torch.stack(each), atol=1e-6, rtol=0)  # 0 seen
+    alone = [exposures.apply([name], image) for name, image in zip(["c", "a"], images, strict=True)]
+    (by_each,) = torch.autograd.grad(torch.stack(alone).square().mean(), exposures.transforms)
+    torch.testing.assert_close(together, torch.stack(alone), atol=1e-6, rtol=0)  # 0 seen
     torch.testing.assert_close(by_all, by_each, atol=1e-6, rtol=0)  # 0 seen
     assert by_all[1].abs().max() == 0
 
@@ -226,11 +226,11 @@ def transforms_of(stops: Sequence[float]) -> dict[str, list[list[float]]]:
 
 def test_neighbours_predict_exposure_that_changes_slowly() -> None:
     slow = transforms_of(np.sin(np.arange(30) / 5))
-    found = predicted_exposures(slow, ["013.jpg", "000.jpg", "999.jpg"])
+    predicted = predicted_exposures(slow, ["013.jpg", "000.jpg", "999.jpg"])
     expected = (np.array(slow["012.jpg"]) + np.array(slow["014.jpg"])) / 2
-    np.testing.assert_allclose(found["013.jpg"], expected, rtol=1e-6)  # 2.5e-8 seen
-    np.testing.assert_allclose(found["000.jpg"], slow["000.jpg"], rtol=1e-6)  # a training photo has its own
-    np.testing.assert_allclose(found["999.jpg"], slow["058.jpg"], rtol=1e-6)  # behind the last one
+    np.testing.assert_allclose(predicted["013.jpg"], expected, rtol=1e-6)  # 2.5e-8 seen
+    np.testing.assert_allclose(predicted["000.jpg"], slow["000.jpg"], rtol=1e-6)  # a training photo has its own
+    np.testing.assert_allclose(predicted["999.jpg"], slow["058.jpg"], rtol=1e-6)  # behind the last one
 
 
 def test_neighbours_say_nothing_where_exposure_jumps() -> None:

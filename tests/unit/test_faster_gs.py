@@ -54,13 +54,13 @@ def test_each_departure_is_one() -> None:
 def test_it_renders_by_the_familys_stand_in(signed: bool) -> None:
     """With arguments that are those of its module: another stand-in than that of the rules."""
     backend = SimpleNamespace(**vars(stand_ins("faster-gs")[faster_gs.MODULE]))
-    case, found = faint(signed), []
+    case, results = faint(signed), []
     for rasterizer in (FasterGsRasterizer("cpu", backend=backend), CpuRasterizer()):
         fresh = case.with_leaves()
         result = fresh.render(rasterizer)
         (result.image * pixel_weights(case)).sum().backward()
-        found.append((result, {name: value.grad for name, value in fresh.field.parameters.items()}, fresh))
-    (theirs, their_gradients, _), (ours, our_gradients, _) = found
+        results.append((result, {name: value.grad for name, value in fresh.field.parameters.items()}, fresh))
+    (theirs, their_gradients, _), (ours, our_gradients, _) = results
     assert ours.image.min() < -0.1 or not signed
     torch.testing.assert_close(theirs.image, ours.image, rtol=0, atol=1e-5)  # worst seen: 6e-7
     for name, gradient in our_gradients.items():
@@ -170,11 +170,11 @@ def test_a_run_of_residuals_learns_as_on_the_cpu_rasterizer(strategy: str, tmp_p
         iterations=30, levels=2, hierarchy="laplacian", sh_degree=1, exposure="off",
         densification=Densification(strategy=strategy, options=options, every=10),
     )  # fmt: skip
-    scene, found = ring_scene(train=5, test=1), []
+    scene, outcomes = ring_scene(train=5, test=1), []
     for rasterizer in (subject().rasterizer, CpuRasterizer()):
         archive = train(tmp_path / rasterizer.name, scene, settings, rasterizer)
         last = [entry["psnr"] for entry in archive.history() if "psnr" in entry][-1]
-        found.append((last, [len(archive.field(level)) for level in archive.available_levels]))
-    (psnr, counts), (expected, their_counts) = found
+        outcomes.append((last, [len(archive.field(level)) for level in archive.available_levels]))
+    (psnr, counts), (expected, their_counts) = outcomes
     assert psnr == pytest.approx(expected, abs=0.1)  # worst seen: 0.004
     assert counts == pytest.approx(their_counts, rel=0.05)  # worst seen: the same

@@ -28,8 +28,8 @@ def test_they_begin_at_multiples_of_16_bytes() -> None:
         moved = field.with_parameters({name: move(value) for name, value in field.parameters.items()})
         for value in moved.parameters.values():
             value.requires_grad_()
-        given = Parameters.of(moved)
-        for part, value in zip(given, moved.parameters.values(), strict=True):
+        parameters = Parameters.of(moved)
+        for part, value in zip(parameters, moved.parameters.values(), strict=True):
             assert part.is_contiguous()
             assert part.data_ptr() % ALIGNMENT == 0
             assert torch.equal(part, value)

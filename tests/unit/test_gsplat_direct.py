@@ -62,7 +62,7 @@ def test_it_is_used_whatever_mode_it_is_first_asked_in() -> None:
 def test_images_gradients_and_what_densification_sees(degree: int, active: int, signed: bool, own_radii: bool) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
-    found = []
+    results = []
     for direct in (True, False):
         field = gaussians(degree, signed)
         for value in field.parameters.values():
@@ -73,8 +73,8 @@ def test_images_gradients_and_what_densification_sees(degree: int, active: int, 
         gradients = [value.grad for value in field.parameters.values()]
         seen = [result.radii.float(), result.means2d.detach(), result.means2d.grad, result.absgrad2d]
         alone = rasterizer.render_image(field.detach(), CAMERA, background=background, sh_degree=active)
-        found.append([result.image.detach(), alone, *seen, *gradients])
-    for one, other in zip(*found, strict=True):
+        results.append([result.image.detach(), alone, *seen, *gradients])
+    for one, other in zip(*results, strict=True):
         assert one is not None
         assert other is not None
         # Sums in another order, in both; an H200 stays within this.
@@ -139,14 +139,14 @@ def test_several_views_are_those_of_single_calls(views: int, degree: int, active
         value.requires_grad_()
     batch = rasterizer.render_batch(together, cameras, background=background, sh_degree=active)
     (batch.image * weights).sum().backward()
-    each = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
-    torch.stack([(one.image * weight).sum() for one, weight in zip(each, weights, strict=True)]).sum().backward()
+    singles = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
+    torch.stack([(one.image * weight).sum() for one, weight in zip(singles, weights, strict=True)]).sum().backward()
     pairs = {
-        "image": (batch.image.detach(), torch.stack([one.image.detach() for one in each])),
-        "radii": (batch.radii.float(), torch.stack([one.radii for one in each]).float()),
-        "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in each])),
-        "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in each])),
-        "absgrad2d": (batch.absgrad2d, torch.stack([one.absgrad2d for one in each])),
+        "image": (batch.image.detach(), torch.stack([one.image.detach() for one in singles])),
+        "radii": (batch.radii.float(), torch.stack([one.radii for one in singles]).float()),
+        "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in singles])),
+        "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in singles])),
+        "absgrad2d": (batch.absgrad2d, torch.stack([one.absgrad2d for one in singles])),
         **{name: (value.grad, alone.parameters[name].grad) for name, value in together.parameters.items()},
     }
     worst = {}
@@ -178,14 +178,14 @@ def test_several_views_take_less_time_than_single_calls() -> None:
         return (time.perf_counter() - start) * 1e3 / 30 / views
 
     alone = milliseconds(1, lambda: rasterizer(field, cameras[0], background=background).image)
-    found = {
+    seconds = {
         views: milliseconds(
             views, lambda n=views: rasterizer.render_batch(field, cameras[:n], background=background).image
         )
         for views in (2, 4, 8)
     }
-    print(f"1 view {alone:.3f} ms", {views: f"{took:.3f} ms a view" for views, took in found.items()})
-    assert found[8] < 1.1 * alone
+    print(f"1 view {alone:.3f} ms", {views: f"{took:.3f} ms a view" for views, took in seconds.items()})
+    assert seconds[8] < 1.1 * alone
 
 
 def test_a_run_for_several_views_a_step(tmp_path: Path) -> None:

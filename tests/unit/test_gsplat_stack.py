@@ -59,12 +59,12 @@ class OnCpu(GsplatRasterizer):
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         self.stacked.append(len(fields))
-        made, asked = super().stack(fields), self.rendered
+        stacked, asked = super().stack(fields), self.rendered
 
         class Watched:
             def render(self, cameras: Sequence[Camera], background: Tensor | None) -> list[Tensor]:
                 asked.append(len(cameras))
-                return made.render(cameras, background)
+                return stacked.render(cameras, background)
 
         return Watched()
 
@@ -111,9 +111,9 @@ def assert_same(found: Composition, expected: Composition) -> None:
 def test_it_is_the_oracles_composition(counts: Sequence[int], direct: bool) -> None:
     rasterizer = OnCpu(direct)
     renderer = at_once(hierarchy(counts), rasterizer)
-    found = renderer.render(CAMERA)
+    composition = renderer.render(CAMERA)
     assert rasterizer.rendered == [len(counts)], "all in one go"
-    assert_same(found, by_the_oracle(renderer).render(CAMERA))
+    assert_same(composition, by_the_oracle(renderer).render(CAMERA))
 
 
 def test_degrees_of_colour_may_differ(direct: bool) -> None:
@@ -152,9 +152,9 @@ def test_gains_and_levels_of_detail(direct: bool) -> None:
 def test_clamped_levels() -> None:
     fields = {level: replace(each, sh=4 * each.sh) for level, each in hierarchy((90, 70)).items()}
     renderer = replace(at_once(fields), clamped=True)
-    found = renderer.render(CAMERA)
-    assert found.base.max() == 1
-    assert_same(found, by_the_oracle(renderer).render(CAMERA))
+    composition = renderer.render(CAMERA)
+    assert composition.base.max() == 1
+    assert_same(composition, by_the_oracle(renderer).render(CAMERA))
 
 
 def test_what_stays_field_by_field() -> None:
@@ -261,9 +261,9 @@ def test_it_is_measured() -> None:
         patch.setattr(
             OnCpu, "render_images", lambda self, field, cameras, *, background: torch.zeros(1, 3, *_size(cameras))
         )
-        found = measure_speed(replace(at_once(hierarchy((30, 20))), stack_pixels=0), [CAMERA], 0, rounds=1)
+        speeds = measure_speed(replace(at_once(hierarchy((30, 20))), stack_pixels=0), [CAMERA], 0, rounds=1)
         one = measure_speed(at_once(hierarchy((30,))), [CAMERA], 0, rounds=1)
-    assert [(each.what, each.gaussians) for each in found[:2]] == [
+    assert [(each.what, each.gaussians) for each in speeds[:2]] == [
         ("levels 1 to 0, one after the other", 50),
         ("levels 1 to 0, all at once", 50),
     ]

@@ -167,8 +167,8 @@ def test_images_are_what_pinhole_cameras_see(tmp_path: Path, caplog: pytest.LogC
         rotation, shift = _pose(index)
         np.testing.assert_allclose(image.cam_from_world().matrix(), np.column_stack([rotation, shift]), atol=1e-12)
         fx, fy, cx, cy = model.cameras[image.camera_id].params
-        place = POINTS @ rotation.T + shift
-        exact = place[:, :2] / place[:, 2:] * (fx, fy) + (cx, cy)
+        in_camera = POINTS @ rotation.T + shift
+        exact = in_camera[:, :2] / in_camera[:, 2:] * (fx, fy) + (cx, cy)
         assert np.abs(exact - [point.xy for point in image.points2D]).max() < 1e-6  # seen 2e-10
     assert all(len(point.track.elements) == 4 for point in model.points3D.values())
     assert sorted(tuple(point.xyz) for point in model.points3D.values()) == sorted(map(tuple, POINTS))

@@ -145,14 +145,14 @@ def losses(count: int) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("writes", [False, True])
 def test_a_loop_shows_the_same(loop: ModuleType, writes: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    found = []
+    shown = []
     for training in (loop.training, reading_late(loop.training)):
         loop.shown.clear(), loop.clock.clear(), loop.clock.append(0)
         returned = training(losses(35), loop.Writer() if writes else None)
-        found.append((returned, list(loop.shown), capsys.readouterr().out))
+        shown.append((returned, list(loop.shown), capsys.readouterr().out))
         assert all(type(each[1]) is float for each in loop.shown if isinstance(each, tuple))
-    assert found[0] == found[1]
-    assert type(found[1][0]) is float, "what a function returns is no late number"
+    assert shown[0] == shown[1]
+    assert type(shown[1][0]) is float, "what a function returns is no late number"
 
 
 def test_the_loop_does_not_wait(loop: ModuleType) -> None:

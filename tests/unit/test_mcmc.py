@@ -252,9 +252,9 @@ def test_residuals_of_many_views_weigh_opacities_less(weight: float | None, view
     for hierarchy, weights in ((Hierarchy.LAPLACIAN, expected), (Hierarchy.NESTED, [expected[0]] * 2)):
         chosen = TrainSettings(hierarchy=hierarchy.value, densification=Densification(strategy=MCMC, options=options))
         stages = StagePlan.create((64, 48), 100, 2, hierarchy=hierarchy)
-        found = [chosen.strategy_of(stage, views, 1000) for stage in stages]
-        assert [each.opacity_weight for each in found if isinstance(each, Mcmc)] == pytest.approx(weights)
-        assert [each.scale_weight for each in found if isinstance(each, Mcmc)] == [0.01, 0.01]
+        strategies = [chosen.strategy_of(stage, views, 1000) for stage in stages]
+        assert [each.opacity_weight for each in strategies if isinstance(each, Mcmc)] == pytest.approx(weights)
+        assert [each.scale_weight for each in strategies if isinstance(each, Mcmc)] == [0.01, 0.01]
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -441,8 +441,8 @@ def test_limits_follow_the_pixels_of_a_level() -> None:
     def limits(pixels: tuple[int, int], **options: int) -> list[int | None]:
         chosen = TrainSettings(densification=Densification(strategy=MCMC, options=Mcmc(**options)))
         stages = zip(plan, pixels, strict=True)
-        found = (chosen.strategy_of(stage, 10, count) for stage, count in stages)
-        return [each.cap_max for each in found if isinstance(each, Mcmc)]
+        strategies = (chosen.strategy_of(stage, 10, count) for stage, count in stages)
+        return [each.cap_max for each in strategies if isinstance(each, Mcmc)]
 
     assert limits((10**9, 10**9)) == [500_000, 1_000_000]
     assert limits((32_000, 160_000)) == [2_000, 10_000]
@@ -467,10 +467,10 @@ def test_auto_follows_the_length_of_a_run_and_what_was_given(options: dict[str, 
     chosen = TrainSettings(**options).densification  # type: ignore[arg-type]  # some of its fields
     assert chosen.strategy == expected
     assert type(chosen.options) is {MCMC: Mcmc, GRADIENTS: Gradients}[expected]
-    given = options.get("densification", Densification())
-    assert isinstance(given, Densification)
+    densification = options.get("densification", Densification())
+    assert isinstance(densification, Densification)
     for name in vars(chosen.options):
-        assert getattr(chosen.options, name) == getattr(given.options, name), name
+        assert getattr(chosen.options, name) == getattr(densification.options, name), name
 
 
 def test_options_of_both_are_refused() -> None:

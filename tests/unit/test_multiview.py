@@ -70,7 +70,7 @@ def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_ar
         ScoredView(rasterizer(plain, camera, background=torch.zeros(3)).image, *pair, loss)
         for camera, *pair, loss in zip(cameras, predicted, target, losses, strict=True)
     )
-    found = view_scores(views, grey, 0.5)
+    scores = view_scores(views, grey, 0.5)
     made_up = torch.zeros(len(cameras), 30, dtype=torch.float64)
     for index in range(30):
         white = torch.zeros(30, 1, 3)
@@ -83,15 +83,15 @@ def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_ar
             marked = (error - error.min()) / (error.max() - error.min()) > 0.5
             made_up[i, index] = image[marked].sum()
     # Sums of up to some dozen pixels, worst seen 4e-7.
-    torch.testing.assert_close(found.pixels.double(), made_up.mean(0), rtol=2e-6, atol=1e-6)
+    torch.testing.assert_close(scores.pixels.double(), made_up.mean(0), rtol=2e-6, atol=1e-6)
     blame = (made_up * torch.tensor([0.5, 0.1, 0.3])[:, None]).sum(0)
     expected = (blame - blame.min()) / (blame.max() - blame.min())
-    torch.testing.assert_close(found.blame.double(), expected, rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(scores.blame.double(), expected, rtol=2e-5, atol=1e-6)
 
 
 def test_a_field_without_gaussians_has_no_scores() -> None:
-    found = view_scores(iter(()), torch.zeros(0, 1, 3, requires_grad=True), 0.1)
-    assert found.pixels.shape == found.blame.shape == (0,)
+    scores = view_scores(iter(()), torch.zeros(0, 1, 3, requires_grad=True), 0.1)
+    assert scores.pixels.shape == scores.blame.shape == (0,)
 
 
 def rendered(by_centre: Tensor, by_absolute: Tensor) -> RenderResult:
@@ -113,8 +113,8 @@ def refined(edit: Callable[[GaussianField], GaussianField], scores: ViewScores) 
     changed = False
     for iteration in range(1, 11):
         assert control.score_threshold(iteration) == (0.1 if iteration == 10 else None)
-        given = scores if iteration == 10 else None
-        changed = control.after_step(model, iteration, rendered(by_centre, by_absolute), CAMERA, given)
+        scores_now = scores if iteration == 10 else None
+        changed = control.after_step(model, iteration, rendered(by_centre, by_absolute), CAMERA, scores_now)
         assert changed == (iteration == 10)
     for name in ("grad2d", "count", "absgrad2d", "shown"):
         assert control.state[name].tolist() == [0] * len(model)
@@ -165,13 +165,13 @@ def test_faint_and_harmful_gaussians_are_removed_late() -> None:
 
 def test_late_pruning_waits_for_a_step() -> None:
     settings = replace(SETTINGS, iterations=30_000, densification=Densification(strategy="multiview"))
-    found = schedule(settings)
+    iterations = schedule(settings)
     ends, done = set(), 0
-    while done < found.iterations:
-        done += found.views_of_step(done)
+    while done < iterations.iterations:
+        done += iterations.views_of_step(done)
         ends.add(done)
-    assert found.late_prunes <= ends
-    assert sorted(found.late_prunes) == [18_000, 21_000, 24_004, 27_004]
+    assert iterations.late_prunes <= ends
+    assert sorted(iterations.late_prunes) == [18_000, 21_000, 24_004, 27_004]
     assert not schedule(replace(settings, densification=Densification(until=30_000))).late_prunes
 
 
@@ -195,13 +195,13 @@ def test_runs_grow_learn_and_score_the_same_views_again(
     def scores(
         scoring: FieldScoring, field: GaussianField, iteration: int, degree: int, threshold: float
     ) -> ViewScores:
-        found = ask(scoring, field, iteration, degree, threshold)
+        asked = ask(scoring, field, iteration, degree, threshold)
         again = ask(scoring, field, iteration, degree, threshold)
-        assert torch.equal(found.pixels, again.pixels), "the same views"
-        assert len(found.pixels) == len(field)
-        assert float(found.blame.max()) <= 1.0
+        assert torch.equal(asked.pixels, again.pixels), "the same views"
+        assert len(asked.pixels) == len(field)
+        assert float(asked.blame.max()) <= 1.0
         scored.append((scoring.losses.stage.level, iteration))
-        return found
+        return asked
 
     monkeypatch.setattr(FieldScoring, "scores", scores)
     archive = train(tmp_path / "run", ring_scene(), settings)

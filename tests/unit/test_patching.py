@@ -977,12 +977,12 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
     folder = os.environ.get("LAPGS_UPSTREAM")
     if not folder:
         pytest.skip("needs checkouts of the backbones: set LAPGS_UPSTREAM to a folder that holds them")
-    found: list[Target] = []
+    targets: list[Target] = []
     for checkout in sorted(Path(folder).iterdir()):
         with suppress(PatchError):  # the rasterizers of some forks have no recipe
-            found += find_targets(checkout)
-    assert found
-    for number, upstream in enumerate(found):
+            targets += find_targets(checkout)
+    assert targets
+    for number, upstream in enumerate(targets):
         for ending in (None, b"\r\n"):
             copy = tmp_path / f"{number}-{'as-is' if ending is None else 'crlf'}"
             shutil.copytree(upstream.folder, copy, ignore=shutil.ignore_patterns("third_party", ".git"))
@@ -993,7 +993,7 @@ def test_real_sources_take_the_patch_and_give_it_back(tmp_path: Path) -> None:
             (target,) = find_targets(copy)
             assert target.recipe.name == upstream.recipe.name
             after = apply(target, *target.recipe.sets)
-            assert {found.state for found in status(target)} <= {State.APPLIED, State.NOT_NEEDED}
+            assert {targets.state for targets in status(target)} <= {State.APPLIED, State.NOT_NEEDED}
             blocks = sum(data.count(b">>> lapgs") for data in after.values())
             spared = [
                 edit

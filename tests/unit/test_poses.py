@@ -101,16 +101,16 @@ def gradient_by_pose(rasterizer: Rasterizer, device: str = "cpu") -> Tensor:
 @pytest.mark.parametrize("direct", [False, True])
 def test_gradient_by_a_pose_through_gsplat_is_that_of_the_oracle(direct: bool) -> None:
     expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))
-    found = gradient_by_pose(GsplatOnCpu(direct, own_radii=True, absgrad=False))
-    assert float((found - expected).abs().max() / expected.abs().max()) < 1e-3  # worst seen 3e-5
+    gradient = gradient_by_pose(GsplatOnCpu(direct, own_radii=True, absgrad=False))
+    assert float((gradient - expected).abs().max() / expected.abs().max()) < 1e-3  # worst seen 3e-5
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("options", [{}, {"direct": False}, {"packed": True}], ids=str)
 def test_gradient_by_a_pose_on_a_gpu_is_that_of_the_oracle(options: dict[str, bool]) -> None:
     expected = gradient_by_pose(OracleRasterizer(three_sigma_cut=False))
-    found = gradient_by_pose(GsplatRasterizer(**options), "cuda")  # type: ignore[arg-type]  # booleans all
-    assert float((found - expected).abs().max() / expected.abs().max()) < 2e-2
+    gradient = gradient_by_pose(GsplatRasterizer(**options), "cuda")  # type: ignore[arg-type]  # booleans all
+    assert float((gradient - expected).abs().max() / expected.abs().max()) < 2e-2
 
 
 def test_what_a_similarity_transform_of_the_scene_explains_is_removed() -> None:
@@ -188,9 +188,9 @@ def test_archived_corrections_move_training_cameras_and_no_others(tmp_path: Path
 def test_held_out_views_move_with_their_neighbours_where_corrections_change_slowly() -> None:
     waves = [[math.sin(i / 4), math.cos(i / 5), 0.2, 30 * math.cos(i / 4), 0.0, -9.0] for i in range(20)]
     slow = {f"{2 * index:03d}.png": [0.01 * each for each in row] for index, row in enumerate(waves)}
-    found = predicted_poses(slow, ["013.png", "004.png"])
-    assert found["013.png"] == pytest.approx(np.mean([slow["012.png"], slow["014.png"]], axis=0), rel=1e-9)
-    assert found["004.png"] == pytest.approx(slow["004.png"], rel=1e-9)  # 0 seen
+    predicted = predicted_poses(slow, ["013.png", "004.png"])
+    assert predicted["013.png"] == pytest.approx(np.mean([slow["012.png"], slow["014.png"]], axis=0), rel=1e-9)
+    assert predicted["004.png"] == pytest.approx(slow["004.png"], rel=1e-9)  # 0 seen
     jumping = {name: [(-1.0) ** index * each for each in row] for index, (name, row) in enumerate(slow.items())}
     assert predicted_poses(jumping, ["013.png"]) == {}
     assert predicted_poses({}, ["013.png"]) == {}

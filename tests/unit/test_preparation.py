@@ -159,14 +159,14 @@ def test_an_unfinished_run_that_gets_a_time_ends_with_it(folder: Path, tmp_path:
 
 
 def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = []
+    rasterizers = []
 
     def counted(name: str, settings: TrainSettings) -> Any:
-        made.append(name)
+        rasterizers.append(name)
         return original(name, settings)
 
     original = preparation.training_rasterizer
     monkeypatch.setattr(preparation, "training_rasterizer", counted)
     request = TrainRequest(folder, tmp_path / "run", SHORT, control=TrainingControl(rasterizer="cpu", threads=1))
     trained(request)
-    assert made == ["cpu"]
+    assert rasterizers == ["cpu"]

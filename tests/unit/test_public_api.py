@@ -33,18 +33,18 @@ def test_every_public_name_is_there_and_importing_the_package_imports_no_torch()
 def test_intrinsics_of_a_level_are_those_of_its_camera(width: int, height: int, level: int) -> None:
     camera = replace(ring_camera(0.3, width, height), cx=0.4 * width, fy=1.3 * width)
     expected = lapgs.level_camera(camera, level).intrinsics
-    found = lapgs.level_intrinsics(camera.intrinsics[None], (width, height), level)[0]
-    torch.testing.assert_close(found, expected)
+    intrinsics = lapgs.level_intrinsics(camera.intrinsics[None], (width, height), level)[0]
+    torch.testing.assert_close(intrinsics, expected)
     # A ray through the image's corner leaves it at the same corner on every level.
     size = torch.tensor([*lapgs.level_size((width, height), level), 1.0])
     full = torch.tensor([width, height, 1.0])
-    torch.testing.assert_close(torch.linalg.solve(found, size), torch.linalg.solve(camera.intrinsics, full))
+    torch.testing.assert_close(torch.linalg.solve(intrinsics, size), torch.linalg.solve(camera.intrinsics, full))
 
 
 def test_intrinsics_of_whole_numbers_are_not_rounded() -> None:
-    found = lapgs.level_intrinsics(torch.tensor([[90, 0, 51], [0, 90, 25], [0, 0, 1]]), (102, 51), 1)
+    intrinsics = lapgs.level_intrinsics(torch.tensor([[90, 0, 51], [0, 90, 25], [0, 0, 1]]), (102, 51), 1)
     expected = torch.tensor([[45.0, 0.0, 25.5], [0.0, 90 * 26 / 51, 25 * 26 / 51], [0.0, 0.0, 1.0]])
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(intrinsics, expected)
 
 
 def test_splats_and_fields_are_the_same_tensors() -> None:
@@ -170,7 +170,7 @@ def test_a_checkpoint_that_could_not_be_read_is_not_written(tmp_path: Path) -> N
         archive.save_checkpoint({**state, **others})
         with pytest.raises(UserInputError, match=r"state\['state'\]\['config'\]\[1\] is a PosixPath, expected tensors"):
             archive.save_checkpoint({"config": [1, Path("x")]})
-        found = archive.load_checkpoint()
-    assert found is not None
-    assert torch.equal(found["optimizer"]["state"][0]["exp_avg"], optimizer.state_dict()["state"][0]["exp_avg"])
-    assert {name: found[name] for name in others} == others
+        checkpoint = archive.load_checkpoint()
+    assert checkpoint is not None
+    assert torch.equal(checkpoint["optimizer"]["state"][0]["exp_avg"], optimizer.state_dict()["state"][0]["exp_avg"])
+    assert {name: checkpoint[name] for name in others} == others

@@ -182,21 +182,22 @@ def test_few_views_for_many_iterations_are_named() -> None:
 
 
 def test_few_photos_get_fewer_iterations_unless_something_says_when_things_happen() -> None:
-    given = TrainSettings()
-    assert [given.for_photos(count).iterations for count in (3, 38, 39, 43, 230)] == [5000, 5000, 5070, 5590, 29_900]
-    assert given.for_photos(231) is given
+    defaults = TrainSettings()
+    lengths = [defaults.for_photos(count).iterations for count in (3, 38, 39, 43, 230)]
+    assert lengths == [5000, 5000, 5070, 5590, 29_900]
+    assert defaults.for_photos(231) is defaults
     assert TrainSettings(iterations=3000).for_photos(43).iterations == 3000
     assert TrainSettings(protocol="paper").for_photos(43).iterations == 30_000
     assert TrainSettings(densification=Densification(until=9000)).for_photos(43).iterations == 30_000
     assert TrainSettings(densification=Densification(reset_every=0)).for_photos(43).iterations == 5590
-    assert given.for_photos(43).densification.strategy == given.densification.strategy == "mcmc"
+    assert defaults.for_photos(43).densification.strategy == defaults.densification.strategy == "mcmc"
 
 
 def test_residuals_of_large_photos_have_a_longer_base_unless_something_says_otherwise() -> None:
-    given, large = TrainSettings(), (3093, 2312)
-    assert given.for_size(large).shares == (Fraction(2, 3), Fraction(1, 3))
-    assert given.for_size((1280, 1080)) is given
-    assert given.shares == (Fraction(1, 2), Fraction(1, 2))
+    defaults, large = TrainSettings(), (3093, 2312)
+    assert defaults.for_size(large).shares == (Fraction(2, 3), Fraction(1, 3))
+    assert defaults.for_size((1280, 1080)) is defaults
+    assert defaults.shares == (Fraction(1, 2), Fraction(1, 2))
     for other in (
         TrainSettings(split="1/2,1/2"),
         TrainSettings(levels=3),

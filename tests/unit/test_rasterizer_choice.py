@@ -161,14 +161,14 @@ def call(device: torch.device) -> Call:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_a_rasterizer_is_rendered_with_the_gradients_of_all_its_inputs(device: str) -> None:
     of = call(torch.device(device))
-    found = rendered(of.own, of, torch.device(device))
-    assert found.image.shape == (3, 48, 48)
-    assert found.radii is not None
-    assert bool((found.radii > 0).any())
-    assert found.gradients.keys() == of.inputs.keys()
+    result = rendered(of.own, of, torch.device(device))
+    assert result.image.shape == (3, 48, 48)
+    assert result.radii is not None
+    assert bool((result.radii > 0).any())
+    assert result.gradients.keys() == of.inputs.keys()
     assert all(value.grad is None for value in of.inputs.values()), "the checkout's tensors stay as they are"
-    assert found.times.forward > 0
-    assert found.times.backward > 0
+    assert result.times.forward > 0
+    assert result.times.backward > 0
 
 
 def test_compared_gaussians_have_gradients_by_their_rotations() -> None:

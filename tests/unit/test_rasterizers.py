@@ -310,10 +310,10 @@ class WithoutCuda:
             )
         if asked["absgrad"]:
             means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
-        found = {"radii": radii, "means2d": means2d, "conics": conics}
+        info = {"radii": radii, "means2d": means2d, "conics": conics}
         if asked.get("packed"):
-            return image, alpha, self._packed(found, asked["absgrad"])
-        return image, alpha, {**found, "gaussian_ids": None}
+            return image, alpha, self._packed(info, asked["absgrad"])
+        return image, alpha, {**info, "gaussian_ids": None}
 
     def _packed(self, found: dict[str, Any], absgrad: bool) -> dict[str, Any]:
         """Return the results of visible Gaussians alone; gradients go to their centres, as in gsplat."""
@@ -378,14 +378,14 @@ def faint(signed: bool) -> Case:
 def test_gsplat_is_the_oracle_where_their_semantics_agree(signed: bool, without_cuda: WithoutCuda) -> None:
     case = faint(signed)
     weights = pixel_weights(case)
-    found = {}
+    results = {}
     for name, rasterizer in (("theirs", GsplatRasterizer("cpu")), ("ours", OracleRasterizer())):
         fresh = case.with_leaves()
         result = fresh.render(rasterizer)
         (result.image * weights).sum().backward()
         gradients = {key: value.grad for key, value in fresh.field.parameters.items()}
-        found[name] = result, {**gradients, "means2d": result.means2d.grad}
-    (theirs, their_gradients), (ours, our_gradients) = found["theirs"], found["ours"]
+        results[name] = result, {**gradients, "means2d": result.means2d.grad}
+    (theirs, their_gradients), (ours, our_gradients) = results["theirs"], results["ours"]
     assert ours.image.min() < -0.1 or not signed
     # Rounding alone; worst seen: image 5e-7, transmittance 5e-7, centres 8e-6, gradients 3.5e-6 of their norm.
     torch.testing.assert_close(theirs.image, ours.image, rtol=0, atol=1e-5)
@@ -485,13 +485,13 @@ def test_gsplat_is_asked_for_the_conventions_of_the_family(without_cuda: Without
 @pytest.mark.usefixtures("without_cuda")
 def test_packed_results_and_gsplats_own_radii_say_the_same() -> None:
     case = faint(True)
-    weights, found = pixel_weights(case), []
+    weights, results = pixel_weights(case), []
     for options in ({}, {"packed": True, "own_radii": True}):
         fresh = case.with_leaves()
         result = fresh.render(GsplatRasterizer("cpu", **options))
         (result.image * weights).sum().backward()
-        found.append(result)
-    whole, packed = found
+        results.append(result)
+    whole, packed = results
     assert 0 < (whole.radii > 0).sum() < len(whole.radii)
     assert torch.equal(whole.means2d, packed.means2d)
     assert torch.equal(whole.means2d.grad.nan_to_num(), packed.means2d.grad)

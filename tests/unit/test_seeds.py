@@ -20,19 +20,19 @@ def test_seeds_that_are_set_meanwhile_move() -> None:
         random.seed(0)
         np.random.seed(seed=0)
         torch.manual_seed(2**32 - 1)
-        found = random.random(), np.random.random(), torch.rand(()).item()
+        numbers = random.random(), np.random.random(), torch.rand(()).item()
     assert (random.seed, np.random.seed, torch.manual_seed) == before
     expected = torch.rand((), generator=torch.Generator().manual_seed(2)).item()
-    assert found == (random.Random(3).random(), np.random.RandomState(3).random_sample(), expected)
+    assert numbers == (random.Random(3).random(), np.random.RandomState(3).random_sample(), expected)
 
 
 def test_other_seeds_stay() -> None:
     with moved_seeds(3):
         random.seed("words")
-        found = random.random()
+        number = random.random()
         random.seed()
-        assert random.random() != found
-    assert found == random.Random("words").random()
+        assert random.random() != number
+    assert number == random.Random("words").random()
     with moved_seeds(0):
         random.seed(7)
     assert random.random() == random.Random(7).random()

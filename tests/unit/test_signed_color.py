@@ -166,9 +166,9 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
     (folder / "shade.cu").write_text("float shade() { return 0.5f; }\n")
     edit = Edit("signed-color", "raw", "shade.cu", "return 0.5f", before="/* raw */")
     recipe = Recipe("some", "Some", (), reinstall="pip install {folder}", edit=(edit,))
-    found = Target(recipe, folder)
-    monkeypatch.setattr(signed_color, "find_targets", lambda _: (found,))
-    return found
+    patch_target = Target(recipe, folder)
+    monkeypatch.setattr(signed_color, "find_targets", lambda _: (patch_target,))
+    return patch_target
 
 
 def test_unpatched_sources_are_to_be_patched(target: Target, tmp_path: Path) -> None:
@@ -221,9 +221,9 @@ def test_every_variant_is_wrapped_to_the_oracles_conventions(variant: str) -> No
         extension = CudaExtension(module, device="cpu")
         assert SignedColorRasterizer(extension).path is ColorPath.NATIVE
         subject = Subject(variant, SignedColorRasterizer(extension), semantics=extension.semantics)
-        found = list(check(subject, chosen))
-    assert len(found) == 2 * len(names)
-    assert [(outcome.case, outcome.problems) for outcome in found if outcome.problems] == []
+        outcomes = list(check(subject, chosen))
+    assert len(outcomes) == 2 * len(names)
+    assert [(outcome.case, outcome.problems) for outcome in outcomes if outcome.problems] == []
 
 
 def test_an_extension_inside_of_a_package_that_is_absent_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:

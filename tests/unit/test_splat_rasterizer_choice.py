@@ -63,10 +63,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_calls_are_those_of_training() -> None:
-    found = calls()
-    assert [(each["width"], each["height"]) for each in found.values()] == [(32, 24)] * 2 + [(16, 12)] * 2
-    assert next(iter(found)) == "0.png of level 0"
-    for inputs in found.values():
+    by_view = calls()
+    assert [(each["width"], each["height"]) for each in by_view.values()] == [(32, 24)] * 2 + [(16, 12)] * 2
+    assert next(iter(by_view)) == "0.png of level 0"
+    for inputs in by_view.values():
         assert refusal(inputs) == ""
         assert inputs["sh_degree"] == 1
         assert inputs["absgrad"]

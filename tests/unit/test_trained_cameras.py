@@ -32,12 +32,12 @@ def test_cameras_are_read_as_they_were_written(archive: RunArchive) -> None:
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.1, -2.0, 1e-3])
     archive.write_cameras(TrainedCameras({"a": Camera(8, 6, 9.1, 9.5, 4.25, 3.0, pose)}, {}))
-    found = archive.cameras()
-    assert found is not None
-    assert (*found.train,) == ("a",)
-    assert found.test == {}
-    assert (found.train["a"].size, found.train["a"].fx, found.train["a"].cx) == ((8, 6), 9.1, 4.25)
-    assert torch.equal(found.train["a"].world_to_camera, pose)
+    cameras = archive.cameras()
+    assert cameras is not None
+    assert (*cameras.train,) == ("a",)
+    assert cameras.test == {}
+    assert (cameras.train["a"].size, cameras.train["a"].fx, cameras.train["a"].cx) == ((8, 6), 9.1, 4.25)
+    assert torch.equal(cameras.train["a"].world_to_camera, pose)
 
 
 DAMAGED: dict[str, tuple[Any, str]] = {

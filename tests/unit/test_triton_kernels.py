@@ -14,7 +14,8 @@ import torch
 from gsplat.cuda import _torch_impl
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.kernels import project, project_backward, project_into
-from lapgs_plugin.gpu_raster.records import Parameters, records_of
+from lapgs_plugin.gpu_raster.records import Parameters
+from tests.gaussian_records import records_of
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch

@@ -85,7 +85,7 @@ def train(folder: Path, scene: Scene, monitor: Monitor | None = None, **options:
 @pytest.mark.parametrize(("hierarchy", "strategy"), [("laplacian", "3dgs"), ("nested", "mcmc")])
 def test_a_scene_trains_and_renders_alike_in_any_units(hierarchy: str, strategy: str, tmp_path: Path) -> None:
     density = Densification(strategy, start=1, every=10, until=20)
-    found = {}
+    psnrs = {}
     for scale in (1e-3, 1.0, 1e3):
         scene = load_scene(write_ring(tmp_path / f"scene{scale}", scale), eval=True, progress=False)
         options = {"hierarchy": hierarchy, "split": "1/2,1/2", "densification": density, "levels": 2}
@@ -95,11 +95,11 @@ def test_a_scene_trains_and_renders_alike_in_any_units(hierarchy: str, strategy:
         base = archive.field(1)
         depth = render_depth(renderer.rasterizer, base, camera)
         middle = depth.depth[HEIGHT // 2, WIDTH // 2] / scale
-        found[scale] = quality, float(base.means.norm(dim=1).median()) / scale, float(middle)
-    assert found[1.0][0] > 12.0, "trained, and not black"
-    for values in found.values():
-        assert values[0] == pytest.approx(found[1.0][0], abs=0.1)  # 0.0004 seen
-        assert values[1:] == pytest.approx(found[1.0][1:], rel=0.02)  # 2e-5 seen
+        psnrs[scale] = quality, float(base.means.norm(dim=1).median()) / scale, float(middle)
+    assert psnrs[1.0][0] > 12.0, "trained, and not black"
+    for values in psnrs.values():
+        assert values[0] == pytest.approx(psnrs[1.0][0], abs=0.1)  # 0.0004 seen
+        assert values[1:] == pytest.approx(psnrs[1.0][1:], rel=0.02)  # 2e-5 seen
 
 
 def test_corrections_of_poses_are_in_the_users_units(tmp_path: Path) -> None:

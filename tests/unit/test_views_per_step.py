@@ -93,15 +93,15 @@ class Batching(CpuRasterizer):
             self.asked.append((len(cameras), (cameras[0].width, cameras[0].height), sh_degree))
         if len(cameras) > self.holds and not warms_up:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
-        each = [self(field, camera, background=background, sh_degree=sh_degree) for camera in cameras]
-        images = torch.stack([result.image for result in each])
+        results = [self(field, camera, background=background, sh_degree=sh_degree) for camera in cameras]
+        images = torch.stack([result.image for result in results])
         if not with_geometry:
-            return RenderResult(images, None, each[0].radii[:0], each[0].means2d.detach()[:0])
-        joined: Any = torch.stack([result.means2d.detach() for result in each])
-        result = RenderResult(images, None, torch.stack([result.radii for result in each]), joined, None)
+            return RenderResult(images, None, results[0].radii[:0], results[0].means2d.detach()[:0])
+        joined: Any = torch.stack([result.means2d.detach() for result in results])
+        result = RenderResult(images, None, torch.stack([result.radii for result in results]), joined, None)
         if images.requires_grad:
             joined.grad = torch.zeros_like(joined)
-            for row, one in enumerate(each):
+            for row, one in enumerate(results):
                 one.means2d.register_post_accumulate_grad_hook(hand_over(joined.grad[row]))
         return result
 
@@ -207,11 +207,11 @@ def test_statistics_of_a_batch_are_those_of_its_views(absgrad: bool) -> None:
     def result(rows: slice) -> RenderResult:
         means2d = torch.zeros_like(gradients[rows], requires_grad=True)
         means2d.grad = gradients[rows]
-        given = [radii[rows], means2d, 2 * gradients[rows].abs()]
+        outputs = [radii[rows], means2d, 2 * gradients[rows].abs()]
         if gradients[rows].shape[0] == 1:
-            given = [radii[rows][0], torch.zeros(n, 2, requires_grad=True), given[2][0]]
-            given[1].grad = gradients[rows][0]
-        return RenderResult(torch.zeros(()), None, *given)
+            outputs = [radii[rows][0], torch.zeros(n, 2, requires_grad=True), outputs[2][0]]
+            outputs[1].grad = gradients[rows][0]
+        return RenderResult(torch.zeros(()), None, *outputs)
 
     gradients = 1e-3 * torch.randn(b, n, 2, generator=generator)
     radii = torch.randint(0, 4, (b, n), generator=generator, dtype=torch.int32)
@@ -293,9 +293,9 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(scene: Scene, tmp_pat
         train(tmp_path / name, scene, settings, each, test_every=1)
         for name, each in (("a", CpuRasterizer()), ("b", batching))
     ]
-    found = [[(e["level"], e["iteration"], e["num_gaussians"], e["psnr"]) for e in run.history()] for run in runs]
-    assert len(found[0]) == len(found[1]) > 60
-    for one, other in zip(*found, strict=True):
+    histories = [[(e["level"], e["iteration"], e["num_gaussians"], e["psnr"]) for e in run.history()] for run in runs]
+    assert len(histories[0]) == len(histories[1]) > 60
+    for one, other in zip(*histories, strict=True):
         assert one[:2] == other[:2]
         if one[0] == 1 and one[1] < 40:  # sums in another order, until one makes a refinement differ
             assert one[2] == other[2]
@@ -327,20 +327,20 @@ def test_regularization_counts_for_each_view_of_a_step(
             densification=Densification(GRADIENTS, options=options),
         )
         train(tmp_path / str(weight), scene, settings, Batching(holds))
-        found = seen[0]
+        parameters = seen[0]
         seen.clear()
-        logits, log_scales = (found[name][0].double().requires_grad_() for name in ("opacities", "scales"))
+        logits, log_scales = (parameters[name][0].double().requires_grad_() for name in ("opacities", "scales"))
         sizes = log_scales.exp().mean() * 5 / scene.extent  # in fifths of the extent
         term = weight * logits.sigmoid().mean() + 2 * weight * sizes
         expected = torch.autograd.grad(4 * term, (logits, log_scales))
         if weight == 0.0:
-            plain = found
+            plain = parameters
             continue
         for name, wanted in zip(("opacities", "scales"), expected, strict=True):
-            assert torch.equal(found[name][0], plain[name][0])
-            added = found[name][1].double() - plain[name][1].double()
+            assert torch.equal(parameters[name][0], plain[name][0])
+            added = parameters[name][1].double() - plain[name][1].double()
             torch.testing.assert_close(added, wanted, rtol=1e-5, atol=1e-9)  # 4e-7 seen
-        assert torch.equal(found["means"][1], plain["means"][1])
+        assert torch.equal(parameters["means"][1], plain["means"][1])
 
 
 def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(scene: Scene, tmp_path: Path) -> None:
@@ -361,16 +361,16 @@ def test_a_stopped_run_for_several_views_ends_where_an_uninterrupted_one_does(sc
 def test_two_views_a_step_learn_what_one_learns(tmp_path: Path) -> None:
     scene = ring_scene(train=8)
     calm = Densification(start=20, until=200, every=20, reset_every=10_000)
-    found = {}
+    losses = {}
     for views in (1, 2):
         settings = replace(
             SETTINGS, levels=1, iterations=400, accumulate_views=1, views_per_step=str(views), densification=calm
         )
         archive = train(tmp_path / str(views), scene, settings)
-        found[views] = archive.history()[-1]["loss"]
+        losses[views] = archive.history()[-1]["loss"]
         first = archive.history()[0]["loss"]
-    assert found[2] < 0.4 * first
-    assert found[2] < 1.25 * found[1]  # 1.0 seen
+    assert losses[2] < 0.4 * first
+    assert losses[2] < 1.25 * losses[1]  # 1.0 seen
 
 
 class Counter(StageHook):
@@ -432,13 +432,13 @@ def test_memory_that_runs_out_halves_the_views_of_a_launch(scene: Scene, tmp_pat
     """One line is shown, and the run has the same result: steps take as many views."""
     settings = replace(SETTINGS, levels=1, views_per_step="4", iterations=30)
     lines, tight = Said(), Batching(holds=1)
-    found = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
+    tight_run = train(tmp_path / "tight", scene, settings, tight, monitor=lines)
     assert [count for count, _, _ in tight.asked] == [4, 2]
     strategy, *halved = lines.lines
     assert strategy == "density control: --strategy 3dgs"
     assert len(halved) == 2
     assert halved[0].startswith("level 0: no memory for 4 views at once; from here on 2 are rendered together")
-    assert plys(found) == plys(train(tmp_path / "one", scene, settings))
+    assert plys(tight_run) == plys(train(tmp_path / "one", scene, settings))
 
     class Full(CpuRasterizer):
         def __call__(self, *args: Any, **kwargs: Any) -> Any:

@@ -39,8 +39,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_commands_of_an_installed_wheel_find_their_files(site: Path, tmp_path: Path) -> None:
-    words, place = [sys.executable, "-c", USE], {"PYTHONPATH": str(site)}
-    out = subprocess.run(words, cwd=tmp_path, env=place, stdout=subprocess.PIPE, text=True, check=True).stdout
+    words, environment = [sys.executable, "-c", USE], {"PYTHONPATH": str(site)}
+    out = subprocess.run(words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
     assert [*topics()] == re.findall(r"^lapgs help (\S+)", out, re.MULTILINE)
     assert (ROOT / "patches/README.md").read_text() in out
     assert len(re.findall(r"^# sample-", out, re.MULTILINE)) == 8, "four variants, two seeds"

@@ -52,8 +52,8 @@ def run(variable: str, scene: Path, folder: Path, *options: str) -> Done:
 
 
 def bare(variable: str, scene: Path, folder: Path) -> Done:
-    place, words = checkout(variable), arguments_of(variable, scene)
-    return run_bare(place / "train.py", adapter_class(place).stand_in_for(place, words), words, folder)
+    root, words = checkout(variable), arguments_of(variable, scene)
+    return run_bare(root / "train.py", adapter_class(root).stand_in_for(root, words), words, folder)
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
