@@ -31,7 +31,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hierarchy.settings import HierarchySettings
 from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext, entry_point_hooks, hooks_line
-from lapgs_plugin.patching.engine import find_targets, plan_apply
+from lapgs_plugin.patching.engine import Target, plan_apply
 from lapgs_plugin.patching.recipe import load_recipes
 from lapgs_plugin.rasterizers.choice import RASTERIZERS
 from lapgs_plugin.scenes import load_scene
@@ -298,8 +298,9 @@ def test_the_recipe_recognises_and_patches_its_rasterizer(installed: Path) -> No
         '#include "my_rasterizer.h"\n__device__ float blend(float colour, int degree) {\n'
         "\treturn max(colour + 0.5f, 0.0f);\n}\n"
     )
-    (target,) = find_targets(installed, load_recipes(installed / "patches"))
-    (change,) = plan_apply(target, {"signed-color", "build-cuda13"})
+    (recipe,) = load_recipes(installed / "patches")
+    assert recipe.recognises(installed)
+    (change,) = plan_apply(Target(recipe, installed), {"signed-color", "build-cuda13"})
     text = change.after.decode()
     assert "#include <cfloat>" in text
     assert "degree < 0 ? colour : max(colour + 0.5f, 0.0f)" in text
