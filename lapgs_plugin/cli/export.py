@@ -48,16 +48,34 @@ class ExportSettings:
         "Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
         "level_<l>_base.html or level_<l>_field.html.",
     )
-    scene: Path | None = option(None, "With --merge or --html: the scene's folder now. Default: where it was trained.")
+    clean: bool = option(
+        False,
+        "Remove floaters: Gaussians that fewer than three training views see, in front of the surface that other views "
+        "see. Prints the PSNR of the training views before and after.",
+    )
+    crop: str | None = option(
+        None,
+        "Remove what lies outside of a box, x0,y0,z0,x1,y1,z1, or a sphere, x,y,z,r, in the scene's units; `lapgs view "
+        "--crop` shows it. Prints the PSNR as --clean does.",
+        metavar="BOX|SPHERE",
+    )
+    scene: Path | None = option(
+        None, "With --merge, --html, --clean or --crop: the scene's folder now. Default: where it was trained."
+    )
     out: Path | None = option(None, "Folder to write to. Default: RUN/export.", names=("--out", "-o"))
 
     def __post_init__(self) -> None:
         check_values(self)
         if not self.merge:
             refuse({"--iterations": self.iterations}, "needs --merge")
-            refuse({"--scene": None if self.html else self.scene}, "needs --merge or --html")
+            needed = self.html or self.clean or self.crop is not None
+            refuse({"--scene": None if needed else self.scene}, "needs --merge, --html, --clean or --crop")
         else:
             refuse({"--level": self.level}, "does not go with --merge, which makes one field of all levels")
+        if self.crop is not None:
+            from lapgs_plugin.fields.crop import Crop
+
+            Crop.parse(self.crop)
         if self.html:
             refuse({"--format": None if self.file_format == PLY else self.file_format}, "does not go with --html")
 
@@ -84,6 +102,8 @@ def export(
         lapgs export runs/garden --merge    # residuals as one ordinary field
 
         lapgs export runs/garden --merge --html    # a page for the web
+
+        lapgs export runs/garden --clean --crop 0,0,0,5    # in a sphere
     """
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.layout import EXPORT
@@ -101,6 +121,7 @@ def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -
     """Write the field of each chosen level as a file."""
     levels = _levels(archive, settings.level)
     fields = {level: archive.field(level) for level in levels}  # a damaged one is refused before anything is written
+    fields = _cleaned(archive, fields, settings)
     _make(folder)
     for level, field in fields.items():
         path = folder / f"{_level_name(archive, level)}.{settings.file_format}"
@@ -116,6 +137,7 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
 
     chosen = archive.manifest.record(settings.level or 0).level
     field = _merged(archive, settings.scene, settings.iterations) if settings.merge else archive.field(chosen)
+    field = _cleaned(archive, {chosen: field}, settings, settings.merge)[chosen]
     if field.signed:
         raise UserInputError(
             f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
@@ -161,6 +183,36 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
         line += ", both after a colour fit" if merged.colors_fitted else ""
     say(f"merged field: {line}")
     return merged.field
+
+
+def _cleaned(
+    archive: RunArchive, fields: dict[int, GaussianField], settings: ExportSettings, merged: bool = False
+) -> dict[int, GaussianField]:
+    """Return fields without floaters and what lies outside of the crop, as asked for, and print what that changes.
+
+    Args:
+        fields: of some levels, or the merged one at level 0.
+    """
+    if not settings.clean and settings.crop is None:
+        return fields
+    from lapgs_plugin.evaluation.cleaning import clean_levels
+    from lapgs_plugin.fields.crop import Crop
+
+    # A residual lies on the surface of the base, and its image is a sum with the coarser ones.
+    coarser = () if merged else filter(lambda level: level > min(fields), archive.available_levels)
+    run = {level: archive.field(level) for level in coarser} | fields
+    crop = None if settings.crop is None else Crop.parse(settings.crop)
+    levels, views = clean_levels(archive, run, settings.scene, floaters=settings.clean, crop=crop)
+    for level, cleaned in sorted(levels.items(), reverse=True):
+        removed = [counted(cleaned.floaters, "floater")] * settings.clean + [f"{cleaned.outside:,} outside"] * bool(
+            crop
+        )
+        before, after = cleaned.psnr
+        say(
+            f"{'merged field' if merged else f'level {level}'}: removed {' and '.join(removed)} of {len(run[level]):,} "
+            f"Gaussians; PSNR of {counted(views, 'training view')} {before:.2f} dB before, {after:.2f} dB after"
+        )
+    return {level: levels[level].field for level in fields}
 
 
 def _write_field(field: GaussianField, path: Path, note: str) -> None:
