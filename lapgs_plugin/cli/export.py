@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from lapgs_plugin.fields.gaussian_field import GaussianField
     from lapgs_plugin.runs.archive import RunArchive
 
-PLY, SPZ = "ply", "spz"
-PAGE, MERGED = "scene.html", "merged"
+PLY, SPZ, SPZ_4, GLB = "ply", "spz", "spz4", "glb"
+SUFFIXES = {PLY: ".ply", SPZ: ".spz", SPZ_4: ".spz", GLB: ".glb"}
+PAGE, MERGED, LOD = "scene.html", "merged", "lod"
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,10 @@ class ExportSettings:
 
     file_format: str = option(
         PLY,
-        "ply (the standard 3DGS layout) or spz (version 3, smaller, lossy).",
+        "ply (the standard 3DGS layout), spz (version 3, smaller, lossy), spz4 (its version 4) or glb (glTF with "
+        "KHR_gaussian_splatting).",
         names=("--format",),
-        choices=(PLY, SPZ),
+        choices=tuple(SUFFIXES),
     )
     level: int | None = option(None, "Level to export; 0 is the finest. Default: all finished levels.")
     merge: bool = option(
@@ -48,18 +50,44 @@ class ExportSettings:
         "Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
         "level_<l>_base.html or level_<l>_field.html.",
     )
-    scene: Path | None = option(None, "With --merge or --html: the scene's folder now. Default: where it was trained.")
+    lod: bool = option(
+        False,
+        "Write the folder lod instead: levels of detail as streamed SOG (lod-meta.json), and each level as SPZ 4 and "
+        "as glTF. Of nested levels, or with --merge of a run with residuals: the merged field and the base.",
+    )
+    clean: bool = option(
+        False,
+        "Remove floaters: Gaussians that fewer than three training views see, in front of the surface that other views "
+        "see. Prints the PSNR of the training views before and after.",
+    )
+    crop: str | None = option(
+        None,
+        "Remove what lies outside of a box, x0,y0,z0,x1,y1,z1, or a sphere, x,y,z,r, in the scene's units; `lapgs view "
+        "--crop` shows it. Prints the PSNR as --clean does.",
+        metavar="BOX|SPHERE",
+    )
+    scene: Path | None = option(
+        None, "With --merge, --html, --clean or --crop: the scene's folder now. Default: where it was trained."
+    )
     out: Path | None = option(None, "Folder to write to. Default: RUN/export.", names=("--out", "-o"))
 
     def __post_init__(self) -> None:
         check_values(self)
         if not self.merge:
             refuse({"--iterations": self.iterations}, "needs --merge")
-            refuse({"--scene": None if self.html else self.scene}, "needs --merge or --html")
+            needed = self.html or self.clean or self.crop is not None
+            refuse({"--scene": None if needed else self.scene}, "needs --merge, --html, --clean or --crop")
         else:
             refuse({"--level": self.level}, "does not go with --merge, which makes one field of all levels")
+        if self.crop is not None:
+            from lapgs_plugin.fields.crop import Crop
+
+            Crop.parse(self.crop)
         if self.html:
             refuse({"--format": None if self.file_format == PLY else self.file_format}, "does not go with --html")
+        if self.lod:
+            chosen = None if self.file_format == PLY else self.file_format
+            refuse({"--format": chosen, "--html": self.html, "--level": self.level}, "does not go with --lod")
 
 
 @takes_settings
@@ -69,7 +97,7 @@ def export(
     ],
     settings: ExportSettings,
 ) -> None:
-    """Export RUN for other viewers: PLY or SPZ files of its levels, one merged field, or a web page.
+    """Export RUN for other viewers: files of its levels, one merged field, levels of detail, or a web page.
 
     Files of levels are named level_<l>_base, level_<l>_residual or level_<l>_field. The base and nested levels are
     ordinary fields that open in any 3DGS viewer. A residual is not: its signed colours are added to the upsampled image
@@ -84,6 +112,10 @@ def export(
         lapgs export runs/garden --merge    # residuals as one ordinary field
 
         lapgs export runs/garden --merge --html    # a page for the web
+
+        lapgs export runs/nested --lod    # levels of detail
+
+        lapgs export runs/garden --clean --crop 0,0,0,5    # in a sphere
     """
     from lapgs_plugin.runs.archive import RunArchive
     from lapgs_plugin.runs.layout import EXPORT
@@ -91,7 +123,9 @@ def export(
     archive = RunArchive.open(run)
     folder = archive.results(EXPORT) if settings.out is None else settings.out
     require_place(folder)
-    if settings.html or settings.merge:
+    if settings.lod:
+        _write_lod(archive, settings, folder / LOD)
+    elif settings.html or settings.merge:
         _write_one(archive, settings, folder)
     else:
         _write_levels(archive, settings, folder)
@@ -101,10 +135,11 @@ def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -
     """Write the field of each chosen level as a file."""
     levels = _levels(archive, settings.level)
     fields = {level: archive.field(level) for level in levels}  # a damaged one is refused before anything is written
+    fields = _cleaned(archive, fields, settings)
     _make(folder)
     for level, field in fields.items():
-        path = folder / f"{_level_name(archive, level)}.{settings.file_format}"
-        _write_field(field, path, _note(archive, level))
+        path = folder / f"{_level_name(archive, level)}{SUFFIXES[settings.file_format]}"
+        _write_field(field, path, _note(archive, level), settings.file_format)
         _print_written(path, field, ", a residual" if field.signed else "")
 
 
@@ -116,6 +151,7 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
 
     chosen = archive.manifest.record(settings.level or 0).level
     field = _merged(archive, settings.scene, settings.iterations) if settings.merge else archive.field(chosen)
+    field = _cleaned(archive, {chosen: field}, settings, settings.merge)[chosen]
     if field.signed:
         raise UserInputError(
             f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
@@ -123,8 +159,8 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
         )
     if not settings.html:
         _make(folder)
-        path = folder / f"{MERGED}.{settings.file_format}"
-        _write_field(field, path, f"one field fitted to the images of {archive.name}")
+        path = folder / f"{MERGED}{SUFFIXES[settings.file_format]}"
+        _write_field(field, path, f"one field fitted to the images of {archive.name}", settings.file_format)
         _print_written(path, field)
         return
     cameras = list(run_cameras(archive, settings.scene)[0].values())
@@ -134,6 +170,49 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
     scene = archive.manifest.scene
     write_splat_page(field, path, archive.name, cameras, scene.background, NEAR_DEPTH * scene.unit)
     _print_written(path, field, ", opens in a browser without a network")
+
+
+def _write_lod(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
+    """Write levels of detail as streamed SOG, and each of them as SPZ 4 and glTF."""
+    from lapgs_plugin.errors import require_extra
+    from lapgs_plugin.fields.sog import LOD_META, save_streamed_sog
+    from lapgs_plugin.files import one_line_errors
+
+    require_extra("zstandard", "spz", "--lod")
+    fields = _levels_of_detail(archive, settings)
+    _make(folder)
+    with one_line_errors(folder):
+        save_streamed_sog(fields, folder)
+    size = sum(path.stat().st_size for path in folder.glob("*/*"))
+    counts = ", ".join(f"{len(field):,}" for _, field in sorted(fields.items()))
+    say(f"{folder / LOD_META}: levels of {counts} Gaussians, {size / 1e6:.1f} MB, streamed SOG")
+    for level, field in sorted(fields.items()):
+        for file_format in (SPZ_4, GLB):
+            path = folder / f"level_{level}{SUFFIXES[file_format]}"
+            _write_field(field, path, f"level {level} of {archive.name}", file_format)
+            _print_written(path, field)
+
+
+def _levels_of_detail(archive: RunArchive, settings: ExportSettings) -> dict[int, GaussianField]:
+    """Return ordinary fields by level, cleaned as asked for: nested ones, or the merged one and the base."""
+    base = archive.manifest.record(archive.manifest.levels - 1).level
+    available = archive.available_levels
+    if len(available) < 2:
+        raise UserInputError(
+            f"{archive.path()} has {counted(len(available), 'level')}, expected two or more for --lod; leave it out, "
+            "or train with --hierarchy nested"
+        )
+    if settings.merge:
+        merged = {0: _merged(archive, settings.scene, settings.iterations)}
+        coarsest = _cleaned(archive, {base: archive.field(base)}, settings)
+        return coarsest | _cleaned(archive, merged, settings, merged=True)
+    fields = {level: archive.field(level) for level in available}
+    if fields[min(fields)].signed:
+        raise UserInputError(
+            f"{archive.path()}: level {min(fields)} is a residual, which no viewer shows by itself; add --merge to fit "
+            "one field to the run, which is then the finest level of detail"
+        )
+    return _cleaned(archive, fields, settings)
 
 
 def _make(folder: Path) -> None:
@@ -163,14 +242,47 @@ def _merged(archive: RunArchive, scene: Path | None, iterations: int | None) -> 
     return merged.field
 
 
-def _write_field(field: GaussianField, path: Path, note: str) -> None:
-    """Write a field as PLY or SPZ, by the suffix of the path."""
+def _cleaned(
+    archive: RunArchive, fields: dict[int, GaussianField], settings: ExportSettings, merged: bool = False
+) -> dict[int, GaussianField]:
+    """Return fields without floaters and what lies outside of the crop, as asked for, and print what that changes.
+
+    Args:
+        fields: of some levels, or the merged one at level 0.
+    """
+    if not settings.clean and settings.crop is None:
+        return fields
+    from lapgs_plugin.evaluation.cleaning import clean_levels
+    from lapgs_plugin.fields.crop import Crop
+
+    # A residual lies on the surface of the base, and its image is a sum with the coarser ones.
+    coarser = () if merged else filter(lambda level: level > min(fields), archive.available_levels)
+    run = {level: archive.field(level) for level in coarser} | fields
+    crop = None if settings.crop is None else Crop.parse(settings.crop)
+    levels, views = clean_levels(archive, run, settings.scene, floaters=settings.clean, crop=crop)
+    for level, cleaned in sorted(levels.items(), reverse=True):
+        removed = [counted(cleaned.floaters, "floater")] * settings.clean + [f"{cleaned.outside:,} outside"] * bool(
+            crop
+        )
+        before, after = cleaned.psnr
+        say(
+            f"{'merged field' if merged else f'level {level}'}: removed {' and '.join(removed)} of {len(run[level]):,} "
+            f"Gaussians; PSNR of {counted(views, 'training view')} {before:.2f} dB before, {after:.2f} dB after"
+        )
+    return {level: levels[level].field for level in fields}
+
+
+def _write_field(field: GaussianField, path: Path, note: str, file_format: str) -> None:
+    """Write a field as a file of a format."""
+    from lapgs_plugin.fields.gltf import save_glb
     from lapgs_plugin.fields.spz import save_spz
     from lapgs_plugin.files import one_line_errors
 
     with one_line_errors(path):
-        if path.suffix == ".spz":
-            save_spz(field, path, note)
+        if file_format in (SPZ, SPZ_4):
+            save_spz(field, path, note, 4 if file_format == SPZ_4 else 3)
+        elif file_format == GLB:
+            save_glb(field, path, note)
         else:
             field.save_ply(path, [note])
 

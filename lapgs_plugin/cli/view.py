@@ -28,6 +28,13 @@ def view(
     baseline: Annotated[
         Path | None, typer.Option(help="Another run of the same scene, shown beside RUN behind a movable divider.")
     ] = None,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOX|SPHERE",
+            help="Show the edges of a box, x0,y0,z0,x1,y1,z1, or a sphere, x,y,z,r, for `lapgs export --crop`.",
+        ),
+    ] = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on. The default accepts this machine only; 0.0.0.0 accepts all.")
     ] = HOST,
@@ -48,18 +55,24 @@ def view(
 
         lapgs view runs/garden --baseline runs/plain
 
+        lapgs view runs/garden --crop 0,0,0,5
+
         ssh -L 8080:localhost:8080 gpu-machine lapgs view runs/garden
     """
     require_extra("viser", "viewer", "lapgs view")
     for folder in filter(None, (run, baseline)):
         require_manifest(folder)
+    from lapgs_plugin.fields.crop import Crop
     from lapgs_plugin.viewer.preview import read_preview
+
+    edges = [] if crop is None else Crop.parse(crop).edges()
 
     # The browser loads the page while this process imports torch and the rasterizer.
     with open_page(host, port, run.absolute().name, "Ctrl-C ends the viewer", read_preview(run)) as page:
         from lapgs_plugin.jit.threads import one_pool
 
         show_log()
+        page.show_edges(edges)
         with one_pool():
             _serve(page, run, baseline, options)
 

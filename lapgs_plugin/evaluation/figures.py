@@ -23,6 +23,7 @@ Its keys, with levels as text as JSON requires:
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -92,8 +93,7 @@ def evaluate_run(
             split, photos = "other", tuple(sorted((*scene.train, *scene.test), key=lambda view: view.name))
         smallest = min(min(view.camera.size) for view in photos)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
-        learned = archive.exposure(archive.available_levels[-1])
-        exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in photos])
+        exposures = learned_exposures(archive, [view.name for view in photos])
         with item_progress("views") as progress:
             measured = [
                 _measure_view(view, renderer.render(view.camera), renderer, distances, exposures.get(view.name))
@@ -120,7 +120,7 @@ def evaluate_run(
         "lpips_missing": dict(distances.missing),
         "fps": speed.fps,
         "masked": any(view.masked for view in photos),
-        "exposure_compensated": learned is not None,
+        "exposure_compensated": archive.exposure(archive.available_levels[-1]) is not None,
         "exposure_predicted": bool(exposures),
     }
     archive.write_metrics(metrics)
@@ -137,17 +137,8 @@ def _measure_view(
     Returns:
         The view's entry of "views", and its figures for "levels" by level.
     """
-    composed = composition.composed
-    if exposure is not None:
-        transform = exposure.to(renderer.device)
-        composed = {level: transform_colors(image, transform) for level, image in composed.items()}
-    photo, mask = view.image.to(renderer.device), view.mask
-    targets: list[tuple[Tensor, Tensor | None]]
-    if mask is None:
-        targets = [(image, None) for image in renderer.pyramid.gaussian(photo, renderer.levels)]
-    else:
-        mask = mask.to(renderer.device)
-        targets = [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]
+    composed, targets = _exposed(composition, exposure), _targets(view, renderer)
+    photo, mask = view.image.to(renderer.device), None if view.mask is None else view.mask.to(renderer.device)
     levels = {
         level: {
             "psnr": psnr(image, *targets[level]),
@@ -165,6 +156,38 @@ def _measure_view(
         **{LPIPS_KEY.format(name): value for name, value in distances.items()},
     }
     return figures, levels
+
+
+def level_psnrs(view: View, renderer: HierarchyRenderer, exposure: Tensor | None) -> dict[int, float]:
+    """Return the PSNR in dB of a view's composed image at each level, against the photo at the level's size.
+
+    The render first gets the photo's exposure, a (3, 4) colour transform, if there is one.
+    """
+    composed, targets = _exposed(renderer.render(view.camera, renderer.finest), exposure), _targets(view, renderer)
+    return {level: psnr(image, *targets[level]) for level, image in composed.items()}
+
+
+def learned_exposures(archive: RunArchive, views: Iterable[str]) -> dict[str, Tensor]:
+    """Return the colour transforms (3, 4) that a run learned, or predicts, of views; empty without compensation."""
+    learned = archive.exposure(archive.available_levels[-1])
+    return {} if learned is None else predicted_exposures(learned, views)
+
+
+def _exposed(composition: Composition, exposure: Tensor | None) -> Mapping[int, Tensor]:
+    """Return the composed images by level, with a photo's exposure if there is one."""
+    composed = composition.composed
+    if exposure is None:
+        return composed
+    return {level: transform_colors(image, exposure.to(image)) for level, image in composed.items()}
+
+
+def _targets(view: View, renderer: HierarchyRenderer) -> list[tuple[Tensor, Tensor | None]]:
+    """Return the photo and its mask at each level, the finest first, on the renderer's device."""
+    photo = view.image.to(renderer.device)
+    if view.mask is None:
+        return [(image, None) for image in renderer.pyramid.gaussian(photo, renderer.levels)]
+    mask = view.mask.to(renderer.device)
+    return [*masked_gaussian(renderer.pyramid, photo, mask, renderer.levels)]
 
 
 def run_metrics(archive: RunArchive, options: RenderOptions | None) -> dict[str, Any]:

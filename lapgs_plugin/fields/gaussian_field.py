@@ -78,6 +78,10 @@ class GaussianField:
         """Return the field with some or all tensors replaced."""
         return GaussianField(**{**self.parameters, **parameters}, signed=self.signed)
 
+    def kept(self, rows: Tensor) -> GaussianField:
+        """Return some of the Gaussians: those of a mask (n,) bool, or of indices in their order."""
+        return self.with_parameters({name: tensor[rows] for name, tensor in self.parameters.items()})
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> GaussianField:
         """Return the field on another device or in another precision, with gradients to this one."""
         return self.with_parameters({k: v.to(device=device, dtype=dtype) for k, v in self.parameters.items()})

@@ -1,8 +1,8 @@
-"""Write a field as an SPZ file, version 3, a compressed format of web viewers.
+"""Write a field as an SPZ file, a compressed format of web viewers.
 
-The format is Niantic's (https://github.com/nianticlabs/spz): gzip around a header of 16 bytes and six arrays, each of
-one quantity of all Gaussians, rounded to 8, 10 or 24 bits. Axes are x right, y up, z back. All readers support version
-3; version 4 replaced gzip in 2026, version 2 has 8 bits for rotations.
+The format is Niantic's (https://github.com/nianticlabs/spz): a header and six arrays, each of one quantity of all
+Gaussians, rounded to 8, 10 or 24 bits. Axes are x right, y up, z back. Version 3 is gzip around all of it, and every
+reader has it. Version 4, of 2026, has a header of 32 bytes, a table of sizes, and each array as a Zstandard frame.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lapgs_plugin.errors import FieldError
+from lapgs_plugin.errors import FieldError, require_extra
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.fields.spherical_harmonics import sh_basis
+from lapgs_plugin.fields.y_up import y_up
 from lapgs_plugin.files import atomic_write
 
-MAGIC, VERSION = 0x5053474E, 3  # "NGSP"
+MAGIC = 0x5053474E  # "NGSP"
 COLOR_SCALE = 0.15
 POSITION_BITS, MOST_FRACTIONAL_BITS = 24, 20
 SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0
 ROTATION_BITS = 9  # of the magnitude of a component; one more is its sign
-TO_SPZ_AXES = torch.tensor([1.0, -1.0, -1.0])
 GZIP_WITH_COMMENT = 0x10
+HEADER_4 = struct.Struct("<IIIBBBBI12x")
+ZSTD_LEVEL = 12
 
 Bytes = NDArray[np.uint8]
 
 
-def save_spz(field: GaussianField, path: Path, comment: str) -> None:
+def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3) -> None:
     """Write a field, completely or not at all.
 
     Positions are rounded to 2^-20 of a world unit or to the resolution that 24 bits allow, standard deviations to 6 %,
@@ -44,16 +45,19 @@ def save_spz(field: GaussianField, path: Path, comment: str) -> None:
     Args:
         field: of any SH degree up to 3.
         path: of the file.
-        comment: Latin-1 text for the gzip header, which viewers ignore.
+        comment: Latin-1 text for the gzip header, which viewers ignore. Version 4 has no place for it.
+        version: 3 or 4.
 
     Raises:
+        MissingExtraError: version 4 needs the extra "spz".
         FieldError: it holds NaN or inf, or a position that 24 bits cannot hold.
         OSError: the folder cannot be written, or the disk is full.
     """
-    field = field.detach().to("cpu", torch.float32)
+    if version == 4:
+        require_extra("zstandard", "spz", "SPZ version 4", "take version 3")
+    field = y_up(field.detach().to("cpu", torch.float32))
     field.require_finite()
     fractional_bits = _fractional_bits(field)
-    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(field), field.sh_degree, fractional_bits, 0, 0)
     arrays = (
         _positions(field, fractional_bits),
         _to_bytes(255.0 * torch.sigmoid(field.opacity_logits)),
@@ -62,8 +66,24 @@ def save_spz(field: GaussianField, path: Path, comment: str) -> None:
         _rotations(field),
         _higher_coefficients(field),
     )
+    streams, facts = [array.tobytes() for array in arrays], (len(field), field.sh_degree, fractional_bits)
     with atomic_write(path) as stream:
-        stream.write(_gzip(b"".join([header, *(array.tobytes() for array in arrays)]), comment))
+        if version == 3:
+            header = struct.pack("<IIIBBBB", MAGIC, 3, *facts, 0, 0)
+            stream.write(_gzip(b"".join([header, *streams]), comment))
+        else:
+            stream.write(_with_table(facts, [content for content in streams if content]))
+
+
+def _with_table(facts: tuple[int, int, int], streams: list[bytes]) -> bytes:
+    """Return a file of version 4: `facts` are the number of Gaussians, the SH degree and the fractional bits."""
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+    frames = [compressor.compress(content) for content in streams]
+    header = HEADER_4.pack(MAGIC, 4, *facts, 0, len(frames), HEADER_4.size)
+    table = [struct.pack("<QQ", len(frame), len(content)) for frame, content in zip(frames, streams, strict=True)]
+    return b"".join([header, *table, *frames])
 
 
 def _fractional_bits(field: GaussianField) -> int:
@@ -82,14 +102,14 @@ def _fractional_bits(field: GaussianField) -> int:
 
 def _positions(field: GaussianField, fractional_bits: int) -> Bytes:
     """Return positions as 24-bit little-endian integers, (n, 3, 3) bytes."""
-    fixed = torch.round(field.means.double() * TO_SPZ_AXES * 2.0**fractional_bits).to(torch.int32).numpy()
+    fixed = torch.round(field.means.double() * 2.0**fractional_bits).to(torch.int32).numpy()
     return np.ascontiguousarray(fixed.astype("<i4")[..., None].view(np.uint8)[..., :3])
 
 
 def _rotations(field: GaussianField) -> Bytes:
     """Return rotations as (n, 4) bytes: two bits for the index of the largest component, then the other three."""
     w, x, y, z = torch.nn.functional.normalize(field.quaternions.double(), dim=1).unbind(dim=1)
-    quaternions = torch.stack([x, -y, -z, w], dim=1).numpy()  # (n, 4) xyzw in SPZ axes
+    quaternions = torch.stack([x, y, z, w], dim=1).numpy()  # (n, 4)
     largest = np.abs(quaternions).argmax(axis=1)
     sign = np.where(np.take_along_axis(quaternions, largest[:, None], axis=1) < 0, -1.0, 1.0)
     quaternions = quaternions * sign  # the largest is positive and is not stored
@@ -104,15 +124,7 @@ def _rotations(field: GaussianField) -> Bytes:
 
 def _higher_coefficients(field: GaussianField) -> Bytes:
     """Return coefficients above degree 0, (n, k - 1, 3) bytes."""
-    turned = field.sh[:, 1:] * _signs_of_basis(field.sh_degree)[1:, None]
-    return _to_bytes(128.0 * turned + 128.0)
-
-
-def _signs_of_basis(degree: int) -> torch.Tensor:
-    """Return the sign (k,) that each basis function changes by when y and z are negated."""
-    anywhere = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]], dtype=torch.float64), dim=1)
-    ratio = sh_basis(anywhere * TO_SPZ_AXES, degree) / sh_basis(anywhere, degree)
-    return torch.sign(ratio[0]).float()
+    return _to_bytes(128.0 * field.sh[:, 1:] + 128.0)
 
 
 def _to_bytes(values: torch.Tensor) -> Bytes:

@@ -102,11 +102,12 @@ class HierarchyRenderer(FieldRenderer):
         fields: Mapping[int, GaussianField],
         rasterizer: Rasterizer,
         offload: FieldOffload | None = None,
+        levels: int | None = None,
     ) -> HierarchyRenderer:
-        """Return a renderer of these fields of a run."""
+        """Return a renderer of these fields of a run; `levels` is 1 for a field that they were merged to."""
         return cls(
             fields=fields,
-            levels=manifest.levels,
+            levels=levels or manifest.levels,
             pyramid=Pyramid(manifest.grid),
             rasterizer=rasterizer,
             background=manifest.scene.background,

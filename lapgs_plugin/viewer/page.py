@@ -10,6 +10,7 @@ import errno
 import io
 import socket
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from lapgs_plugin.viewer.guard import Guard, guarded_server
 from lapgs_plugin.viewer.preview import QUALITY, crop_to_aspect
 
 PORTS_TRIED = 100
+EDGE_COLOR = (255, 170, 0)
+"""RGB of the edges of `--crop`."""
 
 
 def free_port(host: str, port: int) -> int:
@@ -94,6 +97,13 @@ class Page:
     def status(self, text: str) -> None:
         if text != self._status.content:
             self._status.content = text
+
+    def show_edges(self, edges: Sequence[Sequence[Sequence[float]]]) -> None:
+        """Show line segments, two points (3,) in world units each, over the pictures."""
+        if edges:
+            self.server.scene.add_line_segments(
+                "/crop", np.array(edges, np.float32), EDGE_COLOR, thickness=2.0, thickness_units="screen"
+            )
 
     def end_preview(self) -> None:
         """Stop sending the preview, because pictures are rendered from now on."""

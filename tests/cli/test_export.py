@@ -70,7 +70,7 @@ def test_spz_of_one_level(run: Path, tmp_path: Path) -> None:
 
 
 def test_mistakes(run: Path, tmp_path: Path) -> None:
-    refuses(UserInputError, "--format splat: expected ply or spz", lapgs_export, run, "--format", "splat")
+    refuses(UserInputError, "--format splat: expected ply, spz, spz4 or glb", lapgs_export, run, "--format", "splat")
     refuses(RunFolderError, "level 7 is not in this run", lapgs_export, run, "--level", 7)
     (tmp_path / "link").symlink_to("gone")
     refuses(UserInputError, r"--out .*link is no folder; expected a folder", lapgs_export, run, "-o", tmp_path / "link")

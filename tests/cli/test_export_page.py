@@ -81,7 +81,7 @@ def test_pages_that_cannot_be_made_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="level 0 is a residual, which no viewer shows by itself; add --merge"):
         lapgs_export(residuals, "--html")
     refuses(UserInputError, "--format does not go with --html", lapgs_export, residuals, "--html", "--format", "spz")
-    refuses(UserInputError, "--scene needs --merge or --html", lapgs_export, residuals, "--scene", tmp_path)
+    refuses(UserInputError, "--scene needs --merge, --html", lapgs_export, residuals, "--scene", tmp_path)
     assert not (residuals / "export").exists()
 
 

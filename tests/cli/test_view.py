@@ -101,3 +101,16 @@ def test_the_page_is_served_without_torch() -> None:
     """Browsers load the page while the process still imports the renderer."""
     code = "import sys; import lapgs_plugin.viewer.page, lapgs_plugin.cli.view; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_crop_is_shown_by_its_edges(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[object] = []
+    monkeypatch.setattr(
+        viser.SceneApi, "add_line_segments", lambda _, name, points, *__, **___: shown.append(points.shape)
+    )
+    run = write_run(tmp_path / "run", scene)
+    lapgs_view(run)
+    assert shown == []
+    lapgs_view(run, "--crop", "-1,-1,-1,1,1,1")
+    assert shown == [(12, 2, 3)]
+    refuses(UserInputError, "--crop 1: expected six numbers", lapgs_view, run, "--crop", "1")

@@ -11,15 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lapgs_plugin.errors import FieldError
+from lapgs_plugin.errors import FieldError, MissingExtraError
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import sh_basis, sh_to_color
 from lapgs_plugin.fields.spz import save_spz
 from lapgs_plugin.reference_raster import CpuRasterizer
+from tests.refusals import refuses
 from tests.training_scene import blob_field, ring_camera
 
 HALF_TURN = Rotation.from_euler("x", 180, degrees=True)  # between y down, z ahead and y up, z back
@@ -27,9 +29,13 @@ HALF_TURN = Rotation.from_euler("x", 180, degrees=True)  # between y down, z ahe
 
 def read_spz(path: Path) -> tuple[GaussianField, int]:
     """Return the field in the file's axes (y up, z back), and its fractional bits."""
-    data = gzip.decompress(path.read_bytes())
+    data, sizes = stored(path.read_bytes())
     magic, version, count, degree, fractional_bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
-    assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    assert (magic, flags) == (b"NGSP", 0)
+    assert (version, reserved) == ((3, 0) if sizes is None else (4, len(sizes)))
+    rest = (degree + 1) ** 2 - 1
+    if sizes is not None:
+        assert sizes == [count * size for size in (9, 1, 3, 3, 4, 3 * rest) if count * size]
     offset = 16
 
     def take(size: int) -> list[bytes]:
@@ -45,7 +51,6 @@ def read_spz(path: Path) -> tuple[GaussianField, int]:
     first = [[(byte / 255 - 0.5) / 0.15 for byte in row] for row in take(3)]
     scales = [[byte / 16 - 10 for byte in row] for row in take(3)]
     quaternions = [read_rotation(int.from_bytes(row, "little")) for row in take(4)]
-    rest = (degree + 1) ** 2 - 1
     higher = [[(byte - 128) / 128 for byte in row] for row in take(3 * rest)]
     assert offset == len(data)
     sh = torch.cat([torch.tensor(first).view(count, 1, 3), torch.tensor(higher).view(count, rest, 3)], dim=1)
@@ -57,6 +62,23 @@ def read_spz(path: Path) -> tuple[GaussianField, int]:
         sh=sh,
     )
     return field, fractional_bits
+
+
+def stored(content: bytes) -> tuple[bytes, list[int] | None]:
+    """Return a file's first 16 bytes and its arrays without compression, and the sizes of version 4's arrays."""
+    if content[:4] != b"NGSP":
+        return gzip.decompress(content), None
+    number, table = struct.unpack_from("<BI12x", content, 15)
+    assert content[20:32] == bytes(12)
+    offset, arrays = table + 16 * number, []
+    for index in range(number):
+        size, length = struct.unpack_from("<QQ", content, table + 16 * index)
+        frame = content[offset : offset + size]
+        arrays.append(zstandard.ZstdDecompressor().decompress(frame, max_output_size=length))
+        assert len(arrays[-1]) == length
+        offset += size
+    assert offset == len(content)
+    return content[:16] + b"".join(arrays), list(map(len, arrays))
 
 
 def read_rotation(packed: int) -> list[float]:
@@ -99,13 +121,19 @@ def fields(seed: int, degree: int, count: int, size: float) -> GaussianField:
 
 
 @settings(deadline=None, max_examples=60)
-@given(seed=st.integers(0, 2**31), degree=st.integers(0, 3), count=st.integers(0, 40), size=st.floats(1e-3, 1e5))
+@given(
+    seed=st.integers(0, 2**31),
+    degree=st.integers(0, 3),
+    count=st.integers(0, 40),
+    size=st.floats(1e-3, 1e5),
+    version=st.sampled_from((3, 4)),
+)
 def test_every_number_comes_back_within_its_rounding(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, degree: int, count: int, size: float
+    tmp_path_factory: pytest.TempPathFactory, seed: int, degree: int, count: int, size: float, version: int
 ) -> None:
     field = fields(seed, degree, count, size)
     path = tmp_path_factory.mktemp("spz") / "field.spz"
-    save_spz(field, path, "note")
+    save_spz(field, path, "note", version)
     read, fractional_bits = read_spz(path)
     back = in_our_axes(read) if count else read
     assert len(back) == count
@@ -134,6 +162,13 @@ def test_the_picture_is_nearly_the_same(tmp_path: Path) -> None:
     back = in_our_axes(read_spz(tmp_path / "field.spz")[0])
     before, after = (CpuRasterizer()(shown, camera, background=torch.zeros(3)).image for shown in (field, back))
     assert -10 * math.log10(float((before - after).square().mean())) > 40.0  # 44.4 dB seen
+
+
+def test_version_4_without_its_library_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lapgs_plugin.errors.find_spec", lambda _: None)
+    facts = r"SPZ version 4 needs zstandard: pip install 'lapgs_plugin\[spz\]'"
+    refuses(MissingExtraError, facts, save_spz, blob_field(count=2), tmp_path / "field.spz", "", 4)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_comment_stands_in_the_gzip_header(tmp_path: Path) -> None:

@@ -1,0 +1,79 @@
+"""Test `lapgs export --lod`, and the formats spz4 and glb."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runs.archive import RunArchive
+from tests.cli.run_folder import write_run, write_scene
+from tests.cli.test_export import lapgs_export
+from tests.folders import files_in
+from tests.refusals import refuses
+from tests.unit.test_gltf import attributes, read_glb
+from tests.unit.test_sog import read_levels
+from tests.unit.test_spz import in_our_axes, read_spz
+
+
+@pytest.fixture
+def nested(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "nested", write_scene(tmp_path / "scene"), nested=True)
+
+
+def test_nested_levels_are_levels_of_detail(nested: Path) -> None:
+    output = lapgs_export(nested, "--lod")
+    folder = nested / "export" / "lod"
+    assert re.search(r"lod-meta\.json: levels of 200, 250 Gaussians, [\d.]+ MB, streamed SOG", output)
+    assert {name for name in files_in(folder) if "/" not in name} == {
+        *("lod-meta.json", "level_0.spz", "level_1.spz", "level_0.glb", "level_1.glb")
+    }
+    meta, levels = read_levels(folder)
+    assert meta["counts"] == [200, 250]
+    for level in (0, 1):
+        field = RunArchive.open(nested).field(level)
+        spz, glb = (
+            in_our_axes(read_spz(folder / f"level_{level}.spz")[0]),
+            in_our_axes(read_glb(folder / f"level_{level}.glb")),
+        )
+        assert torch.equal(glb.means, field.means)
+        torch.testing.assert_close(spz.means, field.means, atol=2e-6, rtol=0)
+        streamed = torch.cat([part.means for part in levels[level]]).numpy()
+        np.testing.assert_allclose(np.sort(streamed, axis=0), np.sort(field.means.numpy(), axis=0), atol=5e-4)
+
+
+def test_a_run_with_residuals_has_the_merged_field_and_the_base(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"))
+    refuses(UserInputError, "level 0 is a residual.* add --merge", lapgs_export, run, "--lod")
+    assert "merged field:" in lapgs_export(run, "--lod", "--merge", "--iterations", 2)
+    meta, _ = read_levels(run / "export" / "lod")
+    assert meta["counts"] == [450, 250]
+
+
+def test_levels_of_detail_are_cropped(nested: Path) -> None:
+    assert "training views" in lapgs_export(nested, "--lod", "--crop", "0,0,0,1")
+    for level in (0, 1):
+        positions = attributes(nested / "export" / "lod" / f"level_{level}.glb")["POSITION"]
+        assert float(np.linalg.norm(positions, axis=1).max()) <= 1.0
+
+
+def test_other_formats_of_a_level(nested: Path) -> None:
+    lapgs_export(nested, "--format", "spz4", "--level", 0)
+    lapgs_export(nested, "--format", "glb", "--level", 1)
+    assert files_in(nested / "export") == {"level_0_field.spz", "level_1_base.glb"}
+    assert (nested / "export" / "level_0_field.spz").read_bytes()[:8] == b"NGSP\4\0\0\0"
+    assert len(read_glb(nested / "export" / "level_1_base.glb")) == 250
+
+
+def test_mistakes(nested: Path, tmp_path: Path) -> None:
+    for options in (["--format", "spz"], ["--html"], ["--level", 0]):
+        refuses(UserInputError, f"{options[0]} does not go with --lod", lapgs_export, nested, "--lod", *options)
+    single = write_run(tmp_path / "single", tmp_path / "scene", levels=1)
+    refuses(UserInputError, "has 1 level, expected two or more for --lod", lapgs_export, single, "--lod")
+    half = write_run(tmp_path / "half", tmp_path / "scene", finished=1, nested=True)
+    refuses(UserInputError, "has 1 level, expected two or more for --lod", lapgs_export, half, "--lod")
+    assert not any((run / "export").exists() for run in (nested, single, half))
