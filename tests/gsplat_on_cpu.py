@@ -263,13 +263,23 @@ def _looks(given: Parameters, cameras: DeviceCameras, degree: int, signed: bool)
     return colors, given.logits.sigmoid().expand(len(away), -1)
 
 
+def _alone(cameras: DeviceCameras) -> list[DeviceCameras]:
+    """Each camera with its own size."""
+    assert cameras.sizes is not None
+    rows = zip(*(part.split(1) for part in cameras[:3]), cameras.sizes.tolist(), strict=True)
+    return [DeviceCameras(*parts, *size) for *parts, size in rows]
+
+
 def project(
     given: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False
 ) -> Projected:
     """As `kernels.project`, in PyTorch's operations."""
+    if cameras.sizes is not None:
+        views = [project(given, one, degree, signed, with_geometry) for one in _alone(cameras)]
+        return Projected(*map(torch.cat, zip(*views, strict=True)))
     radii, means2d, depths, conics, _ = _project(
         given.means, None, given.quaternions, given.log_scales.exp(), given.logits.sigmoid(),
-        *cameras[:2], *cameras[3:], 0.3, 0.2, 1e10, 0.0, False, "CameraModelType.PINHOLE",
+        *cameras[:2], cameras.width, cameras.height, 0.3, 0.2, 1e10, 0.0, False, "CameraModelType.PINHOLE",
     )  # fmt: skip
     assert radii is not None
     assert means2d is not None
@@ -297,6 +307,10 @@ def project_backward(
     found: Tensor, others: Tensor,
 ) -> Parameters:  # fmt: skip
     """As `kernels.project_backward`, by autograd."""
+    if cameras.sizes is not None:
+        parts = zip(_alone(cameras), *(values[:, None] for values in (radii, records, found, others)), strict=True)
+        views = [project_backward(given, one, degree, signed, *values) for one, *values in parts]
+        return Parameters(*(sum(values) for values in zip(*views, strict=True)))  # type: ignore[misc]
     leaves = Parameters(*(value.detach().clone().requires_grad_() for value in given))
     shown = (radii > 0).all(-1)
     with torch.enable_grad():
@@ -304,7 +318,7 @@ def project_backward(
         scales = leaves.log_scales.exp()
         covariances, _ = _torch_impl._quat_scale_to_covar_preci(leaves.quaternions, scales, compute_preci=False)
         _, means2d, _, conics, _ = _torch_impl._fully_fused_projection(
-            leaves.means, covariances, *cameras[:2], *cameras[3:], eps2d=0.3, near_plane=0.2
+            leaves.means, covariances, *cameras[:2], cameras.width, cameras.height, eps2d=0.3, near_plane=0.2
         )
         seen = torch.cat([colors, opacities[..., None], means2d, conics], -1)[shown]
         total = (seen * torch.cat([found, others[..., :1]], -1)[shown]).sum()

@@ -148,6 +148,11 @@ class Rasterizer(ABC):
         """Whether `render_batch` is available with the options that the rasterizer was made with."""
         return False
 
+    @property
+    def mixes_sizes(self) -> bool:
+        """Whether `render_batch` takes cameras of several sizes."""
+        return False
+
     def render_batch(
         self,
         field: GaussianField,
@@ -157,13 +162,15 @@ class Rasterizer(ABC):
         sh_degree: int | None = None,
         with_geometry: bool = True,
     ) -> RenderResult:
-        """Render b cameras of one size differentiably, with as many launches as one camera takes.
+        """Render b cameras differentiably, with as many launches as one camera takes.
 
-        Every tensor of the result has a leading dimension b.
+        Every tensor of the result has a leading dimension b. If cameras differ in size, all images are as large as the
+        largest. A smaller camera has the top left part of its image. What is beyond it has no meaning. If the loss does
+        not depend on it, gradients, radii and centres are those of the camera alone.
 
         Args:
             field, background, sh_degree: as `__call__` takes them.
-            cameras: two or more.
+            cameras: two or more, of one size unless `mixes_sizes`.
             with_geometry: fill in radii and centres; False leaves them empty and is faster.
         """
         raise NotImplementedError

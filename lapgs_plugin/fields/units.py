@@ -64,6 +64,10 @@ class InUnit(Rasterizer):
     def can_batch(self) -> bool:
         return self._inner.can_batch
 
+    @property
+    def mixes_sizes(self) -> bool:
+        return self._inner.mixes_sizes
+
     def render_batch(
         self,
         field: GaussianField,

@@ -10,18 +10,24 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.ops.mixed_sizes import if_mixed, largest_size, sizes_on_device
 
 NUMBERS_OF_16_BYTES = 4
 
 
 class DeviceCameras(NamedTuple):
-    """Hold c cameras of one image size on the device that renders."""
+    """Hold c cameras on the device that renders. Their images are as large as the largest.
+
+    Attributes:
+        sizes: (c, 2) int32 width and height of each if they differ, else None.
+    """
 
     poses: Tensor  # (c, 4, 4) world to camera
     intrinsics: Tensor  # (c, 3, 3)
     centres: Tensor  # (c, 3) in world coordinates
     width: int
     height: int
+    sizes: Tensor | None = None
 
 
 class _Copied(NamedTuple):
@@ -41,17 +47,21 @@ class CameraCache:
         self._copied: dict[int, _Copied] = {}
 
     def get(self, cameras: Sequence[Camera], like: Tensor) -> DeviceCameras:
-        """Return cameras of one size on the device of `like`; several are concatenated in one launch."""
+        """Return cameras on the device of `like`; several are concatenated in one launch."""
         if len(cameras) == 1:
             return self._one(cameras[0], like).alone
         copied = [self._one(camera, like) for camera in cameras]
-        _, (first, *_), poses, intrinsics, centres = zip(*copied, strict=True)
+        _, _, poses, intrinsics, centres = zip(*copied, strict=True)
         count = len(cameras)
         # Filled up, because Triton compiles anew for tensors that do not begin at a multiple of 16 bytes.
         filling = -count % NUMBERS_OF_16_BYTES
         numbers = torch.cat((*poses, *intrinsics, copied[0].pose[:filling], *centres))
         pose, matrix, _, centre = numbers.split_with_sizes((16 * count, 9 * count, filling, 3 * count))
-        return DeviceCameras(pose.view(-1, 4, 4), matrix.view(-1, 3, 3), centre.view(-1, 3), first.width, first.height)
+        sizes = [camera.size for camera in cameras]
+        own = sizes_on_device(sizes, like.device) if if_mixed(sizes) else None
+        return DeviceCameras(
+            pose.view(-1, 4, 4), matrix.view(-1, 3, 3), centre.view(-1, 3), *largest_size(sizes), own
+        )  # fmt: skip
 
     def _one(self, camera: Camera, like: Tensor) -> _Copied:
         copied = self._copied.get(id(camera))

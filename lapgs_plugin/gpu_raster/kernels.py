@@ -118,6 +118,14 @@ def _shape(
 
 
 @triton.jit
+def _size_of(sizes: tl.tensor, camera: tl.tensor, width: int, height: int, mixed: tl.constexpr) -> tl.tensor:
+    """Return the width and height of a camera's image, which is smaller than others if sizes are `mixed`."""
+    if mixed:
+        width, height = tl.load(sizes + 2 * camera), tl.load(sizes + 2 * camera + 1)
+    return width, height
+
+
+@triton.jit
 def _seen_from(
     poses: tl.tensor, intrinsics: tl.tensor, camera: tl.tensor, x: tl.tensor, y: tl.tensor, z: tl.tensor,
     width: int, height: int, closest: float, family: tl.constexpr,
@@ -268,14 +276,14 @@ def _dimming(
 @triton.jit(do_not_specialize=(*NOT_SPECIALIZED, "width", "height", "first", "start"))
 def _project_kernel(
     means: tl.tensor, quaternions: tl.tensor, scales: tl.tensor, opacities: tl.tensor, sh: tl.tensor,
-    first_sh: tl.tensor, poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor,
+    first_sh: tl.tensor, poses: tl.tensor, intrinsics: tl.tensor, centres: tl.tensor, sizes: tl.tensor,
     radii: tl.tensor, pixels: tl.tensor, depths: tl.tensor, records: tl.tensor,
     visible_radii: tl.tensor, visible_pixels: tl.tensor,
     width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
     modifier: float, blur: float, mult: float, closest: float, farthest: float,
     coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
     tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    exact: tl.constexpr, snug: tl.constexpr, activated: tl.constexpr, alpha: tl.constexpr,
+    exact: tl.constexpr, snug: tl.constexpr, activated: tl.constexpr, alpha: tl.constexpr, mixed: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -288,12 +296,14 @@ def _project_kernel(
         opacity = 1.0 / (1.0 + tl.exp(-opacity))
     camera, placed = first, start + rows
     while camera < first + cameras:  # `range` of a tensor cannot be interpreted with NumPy 2.4
+        own_width, own_height = _size_of(sizes, camera, width, height, mixed)
         u, v, _, _, near, depth, by_x, x_by_z, by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, closest, family
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, own_width, own_height, closest, family
         )
         matrix = intrinsics + 9 * camera
-        pixel_x = tl.load(matrix) * u + tl.load(matrix + 2)
-        pixel_y = tl.load(matrix + 4) * v + tl.load(matrix + 5)
+        pixel_x, pixel_y = (
+            tl.load(matrix) * u + tl.load(matrix + 2), tl.load(matrix + 4) * v + tl.load(matrix + 5)
+        )  # fmt: skip
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, by_x, x_by_z, by_y, y_by_z)
         sharp_wide, skew, sharp_high = _on_screen(xx, xy, xz, yy, yz, zz, px, py, pz, qx, qy, qz)
         wide, high = sharp_wide + blur, sharp_high + blur
@@ -305,7 +315,7 @@ def _project_kernel(
             in_columns, in_rows, radius, seen = _footprint(
                 pixel_x - 0.5, pixel_y - 0.5, wide, skew, high, area, effective,
                 here & (depth > closest) & (depth <= farthest),
-                (width + tile - 1) // tile, (height + tile - 1) // tile, mult, snug, tile,
+                (own_width + tile - 1) // tile, (own_height + tile - 1) // tile, mult, snug, tile,
             )  # fmt: skip
             visible = in_columns > 0
             tl.store(radii + 2 * placed, in_columns, here)
@@ -320,8 +330,8 @@ def _project_kernel(
                 area,
                 opacity,
                 here & (depth >= closest) & (depth <= farthest),
-                width,
-                height,
+                own_width,
+                own_height,
             )
             seen, radius = visible, tl.maximum(across, down)
             tl.store(radii + 2 * placed, across, here)
@@ -478,14 +488,14 @@ def _by_depth(
 @triton.jit(do_not_specialize=("width", "height", "n", "cameras"))
 def _shape_gradient_kernel(
     means: tl.tensor, quaternions: tl.tensor, scales: tl.tensor, opacities: tl.tensor,
-    poses: tl.tensor, intrinsics: tl.tensor, radii: tl.tensor, records: tl.tensor,
+    poses: tl.tensor, intrinsics: tl.tensor, sizes: tl.tensor, radii: tl.tensor, records: tl.tensor,
     by_records: tl.tensor, others: tl.tensor,
     by_mean: tl.tensor, by_quaternion: tl.tensor, by_scale: tl.tensor, by_opacity: tl.tensor,
     by_color: tl.tensor, by_screen: tl.tensor,
     width: int, height: int, n: int, cameras: int, modifier: float, blur: float, closest: float,
     record: tl.constexpr, gradient: tl.constexpr, stride: tl.constexpr, block: tl.constexpr,
     colored: tl.constexpr, columns: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr,
-    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr, activated: tl.constexpr,
+    dimmed: tl.constexpr, exact: tl.constexpr, depth: tl.constexpr, activated: tl.constexpr, mixed: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -506,11 +516,13 @@ def _shape_gradient_kernel(
         of_high = tl.load(others + placed * stride)
         _, _, conic_a, conic_b = load_four(records + placed * record)
         conic_c = tl.load(records + placed * record + 4)
-        of_opacity = tl.where(visible, of_opacity, 0.0)
-        of_x, of_y = tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
+        of_opacity, of_x, of_y = (
+            tl.where(visible, of_opacity, 0.0), tl.where(visible, of_x, 0.0), tl.where(visible, of_y, 0.0)
+        )  # fmt: skip
         wide, skew, high = _of_covariance(of_wide, of_skew, of_high, conic_a, conic_b, conic_c, visible)
+        own_width, own_height = _size_of(sizes, camera, width, height, mixed)
         u, v, limited_u, limited_v, inverse, _, x_by_x, x_by_z, y_by_y, y_by_z = _seen_from(
-            poses, intrinsics, camera, mean_x, mean_y, mean_z, width, height, closest, family
+            poses, intrinsics, camera, mean_x, mean_y, mean_z, own_width, own_height, closest, family
         )
         px, py, pz, qx, qy, qz = _rows_of_projection(poses, camera, x_by_x, x_by_z, y_by_y, y_by_z)
         if dimmed:
@@ -535,8 +547,8 @@ def _shape_gradient_kernel(
             red, green = tl.where(visible, red, 0.0), tl.where(visible, green, 0.0)
             store_three(by_color + 3 * rows, red, green, tl.where(visible, blue, 0.0), here)
         if columns > 0:
-            _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * stride, 0.5 * width,
-                                    0.5 * height, visible, here, columns)  # fmt: skip
+            _store_screen_gradients(by_screen + columns * rows, of_x, of_y, others + placed * stride, 0.5 * own_width,
+                                    0.5 * own_height, visible, here, columns)  # fmt: skip
         camera += 1
     store_three(by_mean + 3 * rows, by_x, by_y, by_z, here)
     if not family and not activated:
@@ -654,6 +666,11 @@ def project_into(
     _project(parameters, None, cameras, (camera, 1), degree, signed, projected, start, False, GSPLAT, NUMBERS)
 
 
+def _sizes_of(cameras: DeviceCameras) -> Tensor:
+    """Return the sizes of cameras, or a tensor that is not read where all have one size."""
+    return cameras.poses if cameras.sizes is None else cameras.sizes
+
+
 def _coefficients(sh: Tensor, rules: Rules) -> int:
     """Return the number of SH coefficients, 0 if there are colours (n, 3) instead."""
     return sh.shape[1] + rules.apart if sh.ndim == 3 else 0
@@ -666,12 +683,13 @@ def _project(
     n = len(parameters.means)
     launch(
         _project_kernel, (blocks(n, BLOCK),),
-        *parameters, parameters.sh if first is None else first, *cameras[:3], *into,
+        *parameters, parameters.sh if first is None else first, *cameras[:3], _sizes_of(cameras), *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
         coefficients=_coefficients(parameters.sh, rules), with_geometry=with_geometry,
         record=RECORD, block=BLOCK, tile=TILE,
         family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
         exact=rules.exact, snug=rules.snug, activated=rules.activated, alpha=rules.alpha,
+        mixed=cameras.sizes is not None,
     )  # fmt: skip
 
 
@@ -724,12 +742,13 @@ def _project_backward(
     n, count, coefficients = len(parameters.means), len(cameras.poses), _coefficients(parameters.sh, rules)
     launch(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
-        *parameters[:4], *cameras[:2], radii, records, by_records, others,
+        *parameters[:4], *cameras[:2], _sizes_of(cameras), radii, records, by_records, others,
         *by, by.means if by_screen is None else by_screen,
         cameras.width, cameras.height, n, count, numbers.modifier, numbers.blur, numbers.near,
         record=RECORD, gradient=GRADIENT, stride=others.shape[-1], block=BLOCK, colored=coefficients == 0,
         columns=0 if by_screen is None else by_screen.shape[1], family=rules.family, covariances=rules.covariances,
         dimmed=rules.dimmed, exact=rules.exact, depth=rules.depth, activated=rules.activated,
+        mixed=cameras.sizes is not None,
     )  # fmt: skip
     if coefficients == 0:
         return

@@ -11,6 +11,7 @@ from torch import Tensor
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
+from lapgs_plugin.ops.mixed_sizes import Sizes
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 
 AS_TRAINED: Mapping[int, float] = MappingProxyType({})
@@ -51,6 +52,7 @@ def compose(
     nested: bool = False,
     gains: Mapping[int, float] = AS_TRAINED,
     clamped: int | None = None,
+    sizes: Sizes | None = None,
 ) -> Composition:
     """Compose the renders of contiguous levels, with gradients where these have them.
 
@@ -61,6 +63,7 @@ def compose(
         nested: whether every render is its level's whole image.
         gains: by level, the factor on its band; 1 for levels that are not in it.
         clamped: a level whose sum is clamped to [0, 1], the last one; None for none.
+        sizes: (width, height) at full size of the views of a batch, if they differ; not with nested levels.
 
     Raises:
         UserInputError: no renders, levels that do not count down by one, or a render that is not twice the coarser one.
@@ -82,7 +85,8 @@ def compose(
         residuals[level] = scaled(residual, gain)
         whole = nested and as_trained
         coarse, shown = composed[level + 1], level == clamped
-        composed[level] = image if whole else upsample_add(pyramid, coarse, residuals[level], clamped=shown)
+        own = None if sizes is None else [level_size(size, level) for size in sizes]
+        composed[level] = image if whole else upsample_add(pyramid, coarse, residuals[level], clamped=shown, sizes=own)
     if base is None:
         raise UserInputError("no renders: expected at least that of the coarsest level")
     return Composition(base, residuals, composed)

@@ -32,6 +32,7 @@ from torch import Tensor
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
 from lapgs_plugin.files import one_line_errors
 from lapgs_plugin.hierarchy.settings import AUTO, PLACES, PRECISIONS
+from lapgs_plugin.ops.mixed_sizes import stack_padded
 
 DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISIONS}
 
@@ -178,8 +179,8 @@ class ImageStore:
     def get(self, *names: str) -> Tensor:
         """Return images on the device, float32, for the current stream: (c, h, w) of one view, (b, c, h, w) of several.
 
-        Do not modify them. The processor waits only for a file that is still being read. Several views have one size;
-        they are decoded together if they are encoded alike.
+        Do not modify them. The processor waits only for a file that is still being read. Views of several sizes are
+        padded at the right and below. They are decoded together if they are encoded alike.
 
         Raises:
             KeyError: there is no such image.
@@ -187,7 +188,7 @@ class ImageStore:
         """
         first, *others = (self._images[name] for name in names)
         if any(image.low != first.low or image.divisor is not first.divisor for image in others):
-            return torch.stack([self.get(name) for name in names])
+            return stack_padded([self.get(name) for name in names])
         return _decode(self._all_arrived(names), first)
 
     def get_stored(self, *names: str) -> Tensor:
@@ -234,7 +235,7 @@ class ImageStore:
     def _all_arrived(self, names: Sequence[str]) -> Tensor:
         """Return the stored bytes of images on the device, with a leading dimension if there are several."""
         stored = [self._arrived(name) for name in names]
-        return stored[0] if len(stored) == 1 else torch.stack(stored)
+        return stored[0] if len(stored) == 1 else stack_padded(stored)
 
     def _arrived(self, name: str) -> Tensor:
         """Return the stored bytes of an image on the device, for the current stream."""

@@ -14,6 +14,7 @@ from lapgs_plugin.hierarchy.masks import masked_gaussian
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.ops.mixed_sizes import stack_padded
 from lapgs_plugin.runs.image_store import DTYPES, ImageStore, choose_place
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
@@ -77,7 +78,7 @@ class HeldImages:
         """Do nothing: images are on the device."""
 
     def get(self, *names: str) -> Tensor:
-        return self._images[names[0]] if len(names) == 1 else torch.stack([self._images[name] for name in names])
+        return self._images[names[0]] if len(names) == 1 else stack_padded([self._images[name] for name in names])
 
     get_stored = get
 

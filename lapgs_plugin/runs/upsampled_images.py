@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
+from lapgs_plugin.ops.mixed_sizes import if_mixed, largest_size
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.runs.image_store import ImageStore
 
@@ -21,7 +22,7 @@ class UpsampledImages:
 
     def __init__(self, store: ImageStore, pyramid: Pyramid) -> None:
         self.store, self.pyramid = store, pyramid
-        self._sizes: dict[str, tuple[int, int]] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}  # (width, height)
 
     def put(self, name: str, image: Tensor, size: tuple[int, int]) -> None:
         """Store a view's image (c, ceil(h / 2), ceil(w / 2)), replacing an earlier one; `get` returns it at (h, w).
@@ -31,7 +32,7 @@ class UpsampledImages:
         """
         require_half(image, size)
         self.store.put(name, image)
-        self._sizes[name] = size
+        self._sizes[name] = size[1], size[0]
 
     @property
     def where(self) -> str:
@@ -44,18 +45,21 @@ class UpsampledImages:
 
     @torch.no_grad()
     def get(self, *names: str) -> Tensor:
-        """Return Up of an image, or of several in as many launches, as a new tensor; see `ImageStore.get`."""
-        return upsample(self.pyramid, self.store.get(*names), self._sizes[names[0]])
+        """Return Up of an image, or of several, as a new tensor; see `ImageStore.get`."""
+        sizes = [self._sizes[name] for name in names]
+        width, height = largest_size(sizes)
+        return upsample(self.pyramid, self.store.get(*names), (height, width), if_mixed(sizes))
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
-        """Return a function that adds Up of the images of some views of one size to (c, h, w), or to (b, c, h, w).
+        """Return a function that adds Up of the images of some views to (c, h, w), or to (b, c, h, w).
 
         The images stay at half size until it is called.
         """
         stored = self.store.get_stored(*names)
         if stored.dtype == torch.uint8:
             stored = stored.div(255)
-        return partial(upsample_add, self.pyramid, stored)
+        sizes = if_mixed([self._sizes[name] for name in names])
+        return partial(upsample_add, self.pyramid, stored, sizes=sizes)
 
     def close(self) -> None:
         """Drop all images and remove the files."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import compose
+from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, largest_size
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
@@ -42,17 +43,26 @@ class RenderedPredictions:
         """Do nothing: predictions are rendered."""
 
     def get(self, *names: str) -> Tensor:
-        """Return Up of the levels' composed image, (3, h, w) of a view or (b, 3, h, w) of several of one size."""
-        width, height = level_size(self.sizes[names[0]], self.levels[-1] - 1)
-        return upsample(self.pyramid, self._composed(names), (height, width))
+        """Return Up of the levels' composed image, (3, h, w) of a view or (b, 3, h, w) of several.
+
+        Those of several sizes are padded, see `ops.mixed_sizes`.
+        """
+        sizes = self._sizes(names, self.levels[-1] - 1)
+        width, height = largest_size(sizes)
+        return upsample(self.pyramid, self._composed(names), (height, width), if_mixed(sizes))
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return the function that adds `get` of the views to an image of that shape."""
-        return partial(upsample_add, self.pyramid, self._composed(names))
+        sizes = if_mixed(self._sizes(names, self.levels[-1] - 1))
+        return partial(upsample_add, self.pyramid, self._composed(names), sizes=sizes)
 
     def _composed(self, names: Sequence[str]) -> Tensor:
         """Return the composed image of the finest level."""
-        return compose(self.pyramid, ((level, self.render(level, names)) for level in self.levels)).image
+        renders = ((level, self.render(level, names)) for level in self.levels)
+        return compose(self.pyramid, renders, sizes=if_mixed(self._sizes(names, 0))).image
+
+    def _sizes(self, names: Sequence[str], level: int) -> Sizes:
+        return [level_size(self.sizes[name], level) for name in names]
 
 
 Predictions = UpsampledImages | RenderedPredictions

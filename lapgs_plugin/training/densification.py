@@ -13,6 +13,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.ops.densification_statistics import add_statistics
+from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, sizes_on_device
 from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
@@ -61,7 +62,7 @@ class DensityControl:
 
         Args:
             result: after `backward()` by the sum of its views' losses; of several views, with a leading dimension.
-            camera: it was rendered from, or any of those cameras.
+            camera: it was rendered from, or the last of those cameras. Gradients are those of views of its size.
         """
 
     def after_step(
@@ -224,6 +225,24 @@ def add_gradients(
     if state[norms] is None:
         state[norms], state[counts] = (gradient.new_zeros(gradient.shape[-2]) for _ in range(2))
     add_statistics(gradient, result.radii, camera.size, state[norms], state[counts])
+
+
+def scale_to_last(result: RenderResult, sizes: Sizes) -> None:
+    """Scale the gradients by centres of a render of several views, in place, as if all were as large as the last.
+
+    Density control measures them in halves of an image, and is given one camera of a render.
+
+    Args:
+        result: after its backward pass.
+        sizes: of the views.
+    """
+    if if_mixed(sizes) is None:
+        return
+    own = sizes_on_device(sizes, result.radii.device)
+    factors = (own / own[-1])[:, None]  # (b, 1, 2)
+    for gradient in (result.means2d.grad, result.absgrad2d):
+        if gradient is not None:
+            gradient.mul_(factors)
 
 
 def required(gradient: Tensor | None, source: str) -> Tensor:

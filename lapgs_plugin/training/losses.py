@@ -14,6 +14,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
+from lapgs_plugin.ops.mixed_sizes import if_mixed, own_part, own_parts
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.stages.images import StageImages
@@ -57,15 +58,16 @@ class ViewLosses:
             self.breakdown.mark("forward")
         return self.images.predictions
 
-    def plain(self, names: Sequence[str]) -> LossOf:
+    def plain(self, names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Return the loss of some views without hooks."""
+        sizes = if_mixed([camera.size for camera in cameras])
         target = self.images.photos.targets.get_stored(*names)
         below = self.below()
         add = None if below is None else below.adder(names)
 
         def loss(rendered: Tensor, _: GaussianField) -> Tensor:
             composed = rendered if add is None else add(rendered)
-            return photometric_loss(self.exposed(names, composed), target, self.ssim_weight)
+            return photometric_loss(self.exposed(names, composed), target, self.ssim_weight, sizes)
 
         return loss
 
@@ -76,14 +78,16 @@ class ViewLosses:
             contexts: result of `contexts`.
             names, cameras: of the views.
         """
+        sizes = [camera.size for camera in cameras]
+        together = self._batches_hooks(cameras)
 
         def of(context: StageContext, shown: Sequence[str], image: Tensor) -> Tensor:
             return self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
 
         def loss(rendered: Tensor, field: GaussianField) -> Tensor:
-            if self.hooks.takes_batches:
+            if together:
                 return of(contexts[0], names, rendered)
-            images = [rendered] if rendered.ndim == 3 else rendered
+            images = [rendered] if rendered.ndim == 3 else own_parts(rendered, sizes)
             losses = []
             for context, name, camera, image in zip(contexts, names, cameras, images, strict=True):
                 here = replace(context, field=FieldInTraining(field, camera, self.rasterizer))
@@ -92,7 +96,9 @@ class ViewLosses:
 
         return loss
 
-    def contexts(self, iterations: Sequence[int], names: Sequence[str]) -> list[StageContext]:
+    def contexts(
+        self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]
+    ) -> list[StageContext]:
         """Return the contexts of hooks: one for each view, or one for all if every hook takes batches."""
         (target, coarse_target), below = self.images.photos.get(*names), self.below()
         context = StageContext(
@@ -104,24 +110,28 @@ class ViewLosses:
             coarse_target=coarse_target,
             weight=self.images.photos.get_weights(*names),
         )
-        if len(names) == 1 or self.hooks.takes_batches:
+        if len(names) == 1 or self._batches_hooks(cameras):
             return [context]
 
         def of(images: Tensor | None, index: int) -> Tensor | None:
-            return None if images is None else images[index]
+            return None if images is None else own_part(images[index], cameras[index].size)
 
         return [
             replace(
                 context,
                 iteration=iteration,
                 view=name,
-                target=target[index],
+                target=own_part(target[index], cameras[index].size),
                 accumulated=of(context.accumulated, index),
                 coarse_target=of(coarse_target, index),
                 weight=of(context.weight, index),
             )
             for index, (iteration, name) in enumerate(zip(iterations, names, strict=True))
         ]
+
+    def _batches_hooks(self, cameras: Sequence[Camera]) -> bool:
+        """Return whether hooks are called once for all views, which takes images of one size."""
+        return self.hooks.takes_batches and not if_mixed([camera.size for camera in cameras])
 
     def exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
         """Return the composed image of a view, or images of several, at the exposure of their photos."""

@@ -13,6 +13,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
 from lapgs_plugin.hierarchy.plan import Stage, level_size
+from lapgs_plugin.ops.mixed_sizes import similar_sizes
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
@@ -22,7 +23,7 @@ from lapgs_plugin.training.densification import DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import iterations_continued, make_plan
 from lapgs_plugin.training.quality import set_aside
-from lapgs_plugin.training.schedule import StageSchedule, views_per_step
+from lapgs_plugin.training.schedule import MOST_PADDING, StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.strategies import Strategy
 
@@ -107,6 +108,11 @@ class PreparedRun(StagedRun):
     def batches(self) -> bool:
         """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
         return not self.settings.refine_poses and self.rasterizer.can_batch
+
+    def size_groups(self, level: int) -> dict[tuple[int, int], int]:
+        """Return the groups of the training views' sizes at a level whose views can be rendered together."""
+        sizes = [level_size(view.camera.size, level) for view in self.scene.train]
+        return similar_sizes(sizes, MOST_PADDING if self.rasterizer.mixes_sizes else 0.0)
 
     def lasting(self, level: int, iterations: int) -> PreparedRun:
         """Return the run whose stage of a level has so many iterations."""

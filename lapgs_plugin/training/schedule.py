@@ -20,6 +20,8 @@ STEPS_OF_A_STAGE = 900
 """Fewest steps of a stage where the program chooses the number of views; a short stage takes fewer views a step."""
 RECOVERY = 300
 """Iterations that a field needs after a reset of opacities."""
+MOST_PADDING = 0.05
+"""Views of several sizes are rendered together if none has more padding than this share of its own pixels."""
 PIXELS_OF_A_LAUNCH = 1 << 22
 """Pixels of views that are rendered together. More of them would take memory and save no time."""
 

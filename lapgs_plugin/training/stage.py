@@ -20,10 +20,11 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
-from lapgs_plugin.training.densification import DensityControl
+from lapgs_plugin.training.densification import DensityControl, scale_to_last
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
@@ -63,7 +64,8 @@ class _Launch:
     """Hold a finished launch: views that were rendered together, after their backward pass.
 
     Attributes:
-        result: of the render without its image; None if density control does not need it.
+        result: of the render without its image; None if density control does not need it. Its gradients are those of
+            views as large as the last.
         camera: of the last view.
         loss: mean of the views' losses.
         iteration: of the last view.
@@ -128,6 +130,7 @@ class StageRun:
         settings = self._settings = prepared.settings
         self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
         self._views = level_views(prepared.scene.train, stage.level)
+        self._size_groups = prepared.size_groups(stage.level) if prepared.batches else {}
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
         self._joint_from = settings.joint_from(replace(stage, iterations=self.schedule.iterations))
         self._dropout = settings.dropout_for(len(self._views))
@@ -270,17 +273,18 @@ class StageRun:
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))
 
     def _launches(self, iterations: range) -> list[_Planned]:
-        """Group the iterations of a step into launches: views of one size and SH degree, no more than fit."""
+        """Group the iterations of a step into launches: views of similar sizes and one SH degree, no more than fit."""
         views = [self._view(iteration) for iteration in iterations]
         if not self.prepared.batches or len(iterations) == 1:
             return [_Planned([iteration], [view]) for iteration, view in zip(iterations, views, strict=True)]
-        alike: dict[tuple[bool, int, int, int], list[int]] = {}
+        alike: dict[tuple[bool, int, int], list[int]] = {}
         for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
             degree = self.schedule.active_sh_degree(iteration)
-            key = (self._is_joint(iteration), view.camera.width, view.camera.height, degree)
+            key = self._is_joint(iteration), self._size_groups[view.camera.size], degree
             alike.setdefault(key, []).append(index)
         launches = []
-        for (_, width, height, _), group in alike.items():
+        for group in alike.values():
+            width, height = largest_size([views[index].camera.size for index in group])
             most = max(1, round(PIXELS_OF_A_LAUNCH / (width * height)))
             count = math.ceil(len(group) / min(most, self.most_views or most))
             size = math.ceil(len(group) / count)
@@ -374,7 +378,8 @@ class StageRun:
             self.train_jointly(None)
         views = [at_pose(view, self.poses) for view in planned.views]
         names, cameras = [view.name for view in views], [view.camera for view in views]
-        loss_of = self._losses.plain(names) if self._losses.is_plain else self._hooked_loss(iterations, names, cameras)
+        plain = self._losses.is_plain
+        loss_of = self._losses.plain(names, cameras) if plain else self._hooked_loss(iterations, names, cameras)
         if then is not None:
             self._prefetch(then)
         self._breakdown.mark("forward")
@@ -394,12 +399,14 @@ class StageRun:
         with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
             # The gradient of the sum of the views' losses; for one view, the default of `backward`.
             loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
+        if result is not None:
+            scale_to_last(result, [camera.size for camera in cameras])
         self._breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Call the hooks that come before a render; return the loss of some views by all hooks."""
-        contexts = self._losses.contexts(iterations, names)
+        contexts = self._losses.contexts(iterations, names, cameras)
         for context in contexts:
             self.hooks.before_render(context)
         self._context = contexts[-1]

@@ -274,12 +274,12 @@ class Trainer:
 
     def _schedule(self, stage: Stage) -> StageSchedule:
         """Return the schedule of a stage; tell the user if its views cannot all be rendered together."""
-        schedule, train = self.prepared.schedule_of(stage), self.prepared.scene.train
-        sizes = {view.camera.size for view in train}
-        if schedule.views > 1 and self.prepared.batches and len(sizes) > 1:
+        schedule = self.prepared.schedule_of(stage)
+        groups = len(set(self.prepared.size_groups(stage.level).values()))
+        if schedule.views > 1 and self.prepared.batches and groups > 1:
             self.monitor.say(
-                f"level {stage.level}: steps for {schedule.views} views; the training views have {len(sizes)} sizes, "
-                "and those of one size are rendered together"
+                f"level {stage.level}: steps for {schedule.views} views; the training views have {groups} groups of "
+                "similar sizes, and those of one group are rendered together"
             )
         return schedule
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from lapgs_plugin.fields.camera import Camera
@@ -9,10 +11,16 @@ from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops import densification_statistics, position_noise, regularization
 from lapgs_plugin.ops.adam import StepScale
+from lapgs_plugin.ops.mixed_sizes import if_mixed
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.prepared_run import PreparedRun
+
+
+def _pairs(camera: Camera, mixes: bool) -> list[list[Camera]]:
+    """Return cameras to render together: of one size, and of two if launches of the run mix sizes."""
+    return [[camera] * 2, *([[camera, replace(camera, height=15)]] if mixes else [])]
 
 
 def warm_up(run: PreparedRun) -> None:
@@ -39,13 +47,14 @@ def warm_up(run: PreparedRun) -> None:
     losses = [photometric_loss(image, target) for image in rendered for target in targets]
     torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]  # torch's
     model.step(means_rate=0.0, active_coefficients=1)
-    if rasterizer.can_batch:
+    groups = run.size_groups(level=0)
+    mixes = len(groups) > len(set(groups.values()))
+    for pair in _pairs(camera, mixes) if rasterizer.can_batch else ():
+        sizes = if_mixed([one.size for one in pair])
         for with_geometry in (True, False):  # rasterizers may take other kernels for images alone
-            images = rasterizer.render_batch(
-                model.field, [camera] * 2, background=black, with_geometry=with_geometry
-            ).image
+            images = rasterizer.render_batch(model.field, pair, background=black, with_geometry=with_geometry).image
             none = torch.zeros(images.shape, dtype=target_types[0], device=device)
-            photometric_loss(images, none).backward()  # type: ignore[no-untyped-call]  # torch's
+            photometric_loss(images, none, sizes=sizes).backward()  # type: ignore[no-untyped-call]  # torch's
             model.step(0.0, 1, scale=StepScale.of(2))
     if on_gpu:
         for operation in (densification_statistics, position_noise, regularization):

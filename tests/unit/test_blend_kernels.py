@@ -141,6 +141,28 @@ with gsplat_on_cpu():
                 gradients = [result.means2d.grad, *(value.grad for value in given.parameters.values())]
                 found.append([result.image.detach(), alone, *gradients])
             close(*found)
+    # Cameras of several sizes have the images, radii, centres and gradients that each has alone.
+    cameras = [camera, replace(camera, width=25, height=18)]
+    together, alone = field(30, False), field(30, False)
+    for given in (together, alone):
+        given.means[0], given.log_scales[0], given.opacity_logits[0] = torch.tensor([1.45, 0.0, 3.0]), -4.0, 1.0
+        for value in given.parameters.values():
+            value.requires_grad_()
+    rasterizer = GsplatOnCpu(True, own_radii=True, absgrad=True)
+    batch = rasterizer.render_batch(together, cameras, background=some)
+    assert batch.image.shape == (2, 3, 20, 25)
+    weights = [torch.randn(3, one.height, one.width) for one in cameras]
+    parts = [batch.image[row, :, : one.height, : one.width] for row, one in enumerate(cameras)]
+    sum((part * weight).sum() for part, weight in zip(parts, weights, strict=True)).backward()
+    assert batch.radii[:, 0].tolist() == [0, 2]  # the first camera has it in its padding
+    for row, one in enumerate(cameras):
+        result = rasterizer(alone, one, background=some)
+        (result.image * weights[row]).sum().backward()
+        assert torch.equal(batch.radii[row], result.radii)
+        assert torch.equal(batch.means2d[row], result.means2d)
+        assert torch.equal(parts[row], result.image)
+        close([batch.means2d.grad[row], batch.absgrad2d[row]], [result.means2d.grad, result.absgrad2d])
+    close([v.grad for v in together.parameters.values()], [v.grad for v in alone.parameters.values()])
     fields = [field(60, True), field(40, False)]
     for cameras, background in (([camera, camera.resized(12, 10)], some), ([camera], None)):
         stacks = DirectStack(fields, torch.device("cpu")), GsplatStack(fields, torch.device("cpu"))

@@ -126,7 +126,20 @@ for shape, kind, interleaved in (
     gradient, expected = (torch.autograd.grad(3 * loss, prediction)[0] for loss in losses)
     assert gradient.stride() == prediction.stride()
     close(gradient * gradient.numel(), expected * gradient.numel(), 1e-4)  # values to 7; worst seen 3e-6
-broken = prediction.detach().clone()
+# Views of several sizes, of which the last has no row of the third program of the largest.
+sizes = [(37, 70), (41, 64), (40, 31)]
+views = torch.rand(2, 3, 70, 41, 3).movedim(-1, 2)
+views[:, 0, :, :, 37:] = views[:, 1, :, 64:] = views[:, 2, :, 31:] = torch.nan  # is not read
+prediction, target = views[0].requires_grad_(), (255 * views[1]).nan_to_num().to(torch.uint8)
+loss = photometric_loss_triton(prediction, target, 0.2, sizes)
+(gradient,) = torch.autograd.grad(3 * loss, prediction)
+exact = prediction.detach().double().requires_grad_()
+parts = [(exact[i, :, :h, :w], target[i, :, :h, :w].double() / 255) for i, (w, h) in enumerate(sizes)]
+expected = torch.stack([photometric_loss_torch(*part, 0.2) for part in parts]).mean()
+close(loss.double(), expected)
+(by_views,) = torch.autograd.grad(3 * expected, exact)
+close((gradient * gradient.numel()).double(), by_views * gradient.numel(), 1e-4)  # values to 16; worst seen 4.5e-6
+broken = prediction.detach().clone()[0, :, :18, :5]
 broken[1, 0, 0] = torch.nan
 assert photometric_loss_triton(broken, stored, 0.2).isnan()
 cut = torch.rand(3, 4, 6)[:, 1:, 1:]  # with gaps in memory
@@ -198,6 +211,26 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
             gradients.append(leaf.grad)
         for gradient in gradients[1:]:
             torch.testing.assert_close(gradient, gradients[0], rtol=0, atol=1e-5)
+
+# Views of several sizes: each is upsampled as if it were alone, and nothing of the others reaches it.
+sizes = [(45, 30), (44, 31), (43, 29)]
+for grid in ("camera", "even"):
+    pyramid, fine, coarse = Pyramid(grid), torch.randn(3, 3, 31, 45), torch.randn(3, 3, 16, 23)
+    leaves = fine.requires_grad_(), coarse.requires_grad_()
+    weights = torch.zeros_like(fine)
+    for index, (w, h) in enumerate(sizes):
+        weights[index, :, :h, :w] = torch.randn(3, h, w)
+    found = upsample_add_triton(pyramid, coarse, fine, False, sizes)
+    by_all = torch.autograd.grad((found * weights).sum(), leaves)
+    expected = torch.zeros_like(found)
+    for index, (w, h) in enumerate(sizes):
+        half = coarse[index, :, : (h + 1) // 2, : (w + 1) // 2]
+        expected[index, :, :h, :w] = pyramid.up(half, (h, w)) + fine[index, :, :h, :w]
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+    for one, other in zip(by_all, torch.autograd.grad((expected * weights).sum(), leaves), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+    with torch.no_grad():
+        torch.testing.assert_close(upsample_add_triton(pyramid, coarse, fine, False, sizes), found)
 """
 
 

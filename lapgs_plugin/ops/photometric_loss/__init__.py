@@ -9,6 +9,7 @@ from importlib import import_module
 import torch
 from torch import Tensor
 
+from lapgs_plugin.ops.mixed_sizes import Sizes, own_parts
 from lapgs_plugin.ops.photometric_loss.in_torch import (
     DEFAULT_SSIM_WEIGHT,
     check_arguments,
@@ -19,7 +20,9 @@ from lapgs_plugin.ops.photometric_loss.in_torch import (
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
-def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT) -> Tensor:
+def photometric_loss(
+    prediction: Tensor, target: Tensor, ssim_weight: float = DEFAULT_SSIM_WEIGHT, sizes: Sizes | None = None
+) -> Tensor:
     """Return the loss of 3DGS, (1 - ssim_weight) L1 + ssim_weight (1 - SSIM), differentiable by the prediction.
 
     It is a scalar, the mean over several views. On the CPU a fused kernel computes it together with its gradient. On a
@@ -30,6 +33,7 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
             channels take longer on a GPU.
         target: of that shape, without gradient; any float type, or uint8 levels k of k / 255.
         ssim_weight: lambda, in [0, 1].
+        sizes: (width, height) of several views, each in the top left of its image; None if they are whole.
 
     Raises:
         UserInputError: the images differ in shape, their channels come last, the target requires a gradient, the
@@ -39,7 +43,10 @@ def photometric_loss(prediction: Tensor, target: Tensor, ssim_weight: float = DE
     if prediction.shape[-3] == 3 and triton_works(prediction):
         from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 
-        return photometric_loss_triton(prediction, target, ssim_weight)
+        return photometric_loss_triton(prediction, target, ssim_weight, sizes)
+    if sizes is not None:
+        pairs = zip(own_parts(prediction, sizes), own_parts(target, sizes), strict=True)
+        return torch.stack([photometric_loss(one, other, ssim_weight) for one, other in pairs]).mean()
     target = decoded(target).to(prediction.dtype)
     if prediction.device.type == "cpu":
         from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
+from lapgs_plugin.ops.mixed_sizes import Sizes, sizes_on_device
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
 
 COLORS = 3
@@ -45,6 +46,18 @@ def _place(width: int, colors: tl.constexpr, interleaved: tl.constexpr, block: t
 
 
 @triton.jit
+def _own_size(
+    size: tl.tensor, width: int, height: int, l1_weight: float, ssim_weight: float, mixed: tl.constexpr
+) -> tl.tensor:
+    """Return an image's width and height, and the weights of one of its pixels."""
+    if mixed:
+        width, height = tl.load(size), tl.load(size + 1)
+        pixels = width.to(tl.float32) * height.to(tl.float32)
+        l1_weight, ssim_weight = l1_weight / pixels, ssim_weight / pixels
+    return width, height, l1_weight, ssim_weight
+
+
+@triton.jit
 def _shifted(sums: tl.tuple, row: tl.tensor, window: tl.constexpr, radius: tl.constexpr) -> tl.tuple:
     """Add a row to the sums of output rows that are not complete: (the complete one, the others with a new one)."""
     after = ()
@@ -70,11 +83,12 @@ def _ssim(
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
-    values: tl.tensor,
+    values: tl.tensor, sizes: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, mapped: tl.constexpr,
-    interleaved: tl.constexpr, window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
+    interleaved: tl.constexpr, mixed: tl.constexpr, window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr,
+    block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the derivatives of SSIM by the local means of x, x squared and x y, and add to the loss.
 
@@ -83,10 +97,12 @@ def _loss_kernel(
         by_mean, by_square, by_product: with the strides of x.
         total: the loss; unused if `mapped`.
         values: SSIM itself, with the strides of x; unused unless `mapped`.
+        sizes: (b, 2) of the images' own parts if they are `mixed`; weights are then divided by their pixels here.
         scale: of y.
     """
-    column, color = _place(width, colors, interleaved, block, 2 * radius)
     image, first = tl.program_id(2).to(tl.int64), tl.program_id(1) * rows
+    width, height, l1_weight, ssim_weight = _own_size(sizes + 2 * image, width, height, l1_weight, ssim_weight, mixed)
+    column, color = _place(width, colors, interleaved, block, 2 * radius)
     last = tl.minimum(first + rows, height)
     at_x = image * x_image + color * x_plane + column * x_column
     of_y = y + image * y_image + color * y_plane + column * y_column
@@ -101,8 +117,9 @@ def _loss_kernel(
         for near in tl.static_range(2 * radius + 2):
             there = (column + (near - radius)).to(tl.uint32) < limit.to(tl.uint32)
             one = tl.load(x + at_x + row.to(tl.int64) * x_row + (near - radius) * x_column, there, 0.0)
-            other = tl.load(of_y + row.to(tl.int64) * y_row + (near - radius) * y_column, there, 0)
-            other = other.to(tl.float32) * scale
+            other = (
+                tl.load(of_y + row.to(tl.int64) * y_row + (near - radius) * y_column, there, 0).to(tl.float32) * scale
+            )
             square, product = one * one + other * other, one * other
             if near <= 2 * radius:
                 x0 += window[near] * one
@@ -140,15 +157,16 @@ def _loss_kernel(
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _gradient_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor,
-    by_loss: tl.tensor, gradient: tl.tensor,
+    by_loss: tl.tensor, gradient: tl.tensor, sizes: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
-    x_column: tl.constexpr, y_column: tl.constexpr, interleaved: tl.constexpr,
+    x_column: tl.constexpr, y_column: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the gradient by x, with the strides of x; arguments as `_loss_kernel` takes them."""
-    column, color = _place(width, colors, interleaved, block, 2 * radius)
     image = tl.program_id(2).to(tl.int64)
+    width, height, l1_weight, ssim_weight = _own_size(sizes + 2 * image, width, height, l1_weight, ssim_weight, mixed)
+    column, color = _place(width, colors, interleaved, block, 2 * radius)
     first = tl.program_id(1) * rows
     last = tl.minimum(first + rows, height)
     at_x = image * x_image + color * x_plane + column * x_column
@@ -192,31 +210,36 @@ def _gradient_kernel(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """Map (prediction, target, ssim_weight), images (b, 3, h, w), to the loss."""
+    """Map (prediction, target, ssim_weight, sizes or None), images (b, 3, h, w), to the loss."""
 
     @staticmethod
-    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None) -> Tensor:
         total = torch.full((), ssim_weight, device=prediction.device)
         assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
         maps = [torch.empty_like(prediction) for _ in range(3)]
         assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
-        programs, sizes, columns = _launch_of(prediction, target, ssim_weight)
+        own = prediction if sizes is None else sizes_on_device(sizes, prediction.device)
+        programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, total, total, *sizes, **columns, **SSIM_CONSTANTS,
-            mapped=False, **CONSTANTS,
+            _loss_kernel, programs, prediction, target, *maps, total, total, own, *numbers, **constants,
+            **SSIM_CONSTANTS, mapped=False, **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
-        ctx.ssim_weight = ssim_weight
+        ctx.ssim_weight, ctx.own = ssim_weight, None if sizes is None else own
         return total
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None, None]:
         prediction, target, *maps = ctx.saved_tensors
-        gradient = torch.empty_like(prediction)
-        programs, sizes, columns = _launch_of(prediction, target, ctx.ssim_weight)
-        launch(_gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, *sizes, **columns, **CONSTANTS)
-        return gradient, None, None
+        mixed = ctx.own is not None
+        gradient = torch.zeros_like(prediction) if mixed else torch.empty_like(prediction)
+        programs, numbers, constants = _launch_of(prediction, target, ctx.ssim_weight, mixed=mixed)
+        launch(
+            _gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, ctx.own if mixed else gradient,
+            *numbers, **constants, **CONSTANTS,
+        )  # fmt: skip
+        return gradient, None, None, None
 
 
 class _SsimMap(torch.autograd.Function):
@@ -225,10 +248,10 @@ class _SsimMap(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor) -> Tensor:
         values, *maps = (torch.empty_like(prediction) for _ in range(4))
-        programs, sizes, columns = _launch_of(prediction, target, 1.0)
+        programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, values, values, *sizes, **columns, **SSIM_CONSTANTS,
-            mapped=True, **CONSTANTS,
+            _loss_kernel, programs, prediction, target, *maps, values, values, values, *numbers, **constants,
+            **SSIM_CONSTANTS, mapped=True, **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         return values
@@ -242,31 +265,41 @@ class _SsimMap(torch.autograd.Function):
         by_values = by_values.contiguous()
         maps = [by_values * each for each in maps]
         factor = prediction.new_full((), -prediction.numel())
-        programs, sizes, columns = _launch_of(prediction, target, 1.0)
-        launch(_gradient_kernel, programs, prediction, target, *maps, factor, gradient, *sizes, **columns, **CONSTANTS)
+        programs, numbers, constants = _launch_of(prediction, target, 1.0)
+        launch(
+            _gradient_kernel, programs, prediction, target, *maps, factor, gradient, gradient, *numbers, **constants,
+            **CONSTANTS,
+        )  # fmt: skip
         return gradient, None
 
 
 def _launch_of(
-    prediction: Tensor, target: Tensor, ssim_weight: float
+    prediction: Tensor, target: Tensor, ssim_weight: float, *, mixed: bool = False
 ) -> tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]:
-    """Return the programs of a launch, and the numbers and constants that both kernels share."""
+    """Return the programs of a launch, and the numbers and constants that both kernels share.
+
+    Weights are those of a pixel and colour, or if sizes are `mixed` of a view and colour.
+    """
     b, _, h, w = prediction.shape
     strips = blocks(blocks(w, 2) * COLORS, BLOCK)
     rows = rows_of_program(h, strips * b, LEAST_ROWS)
-    per_value = 1 / prediction.numel()
+    per_value = 1 / (b * COLORS if mixed else prediction.numel())
     scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
     weights = (1 - ssim_weight) * per_value, ssim_weight * per_value
     (*x_strides, x_column), (*y_strides, y_column) = prediction.stride(), target.stride()
     numbers = h, w, rows, scale, *weights, *x_strides, *y_strides
-    columns = {"x_column": x_column, "y_column": y_column, "interleaved": prediction.stride(1) == 1}
-    return (strips, blocks(h, rows), b), numbers, columns
+    interleaved = prediction.stride(1) == 1
+    constants = {"x_column": x_column, "y_column": y_column, "interleaved": interleaved, "mixed": mixed}
+    return (strips, blocks(h, rows), b), numbers, constants
 
 
-def photometric_loss_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric_loss_triton(
+    prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None = None
+) -> Tensor:
     """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
     image = _without_gaps(as_batch(prediction))
-    loss: Tensor = _PhotometricLoss.apply(image, as_batch(target), ssim_weight)  # type: ignore[no-untyped-call]  # torch's
+    options = as_batch(target), ssim_weight, sizes
+    loss: Tensor = _PhotometricLoss.apply(image, *options)  # type: ignore[no-untyped-call]  # torch's
     return loss
 
 

@@ -10,20 +10,25 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
+from lapgs_plugin.ops.mixed_sizes import Sizes, own_parts, stack_padded
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 LARGEST_DIFFERENCE = 1e-4
 """Largest difference from PyTorch's operations, of values of about 1, that counts as rounding."""
 
 
-def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: bool = False) -> Tensor:
+def upsample_add(
+    pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: bool = False, sizes: Sizes | None = None
+) -> Tensor:
     """Return Up(coarse) + fine, equal to `pyramid.up(coarse) + fine` up to rounding, with its gradient.
 
     Args:
         coarse: (c, ceil(h / 2), ceil(w / 2)), or (b, c, ...) for several images; float16 is taken, too.
         fine: (c, h, w) or (b, c, h, w), on the same device.
         clamped: clamp the sum to [0, 1], to show it; without gradient.
+        sizes: (width, height) of several fine images, each in the top left of its own; None if they are whole.
 
     Raises:
         UserInputError: `coarse` is not half of `fine`, or has other channels.
@@ -35,7 +40,10 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
     if triton_works(fine):
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
-        return upsample_add_triton(pyramid, coarse, fine, clamped)
+        return upsample_add_triton(pyramid, coarse, fine, clamped, sizes)
+    if sizes is not None:
+        pairs = zip(_halves(coarse, sizes), own_parts(fine, sizes), strict=True)
+        return stack_padded([upsample_add(pyramid, one, other, clamped=clamped) for one, other in pairs])
     if clamped:
         return upsample_add(pyramid, coarse, fine).clamp_(0.0, 1.0)
     coarse = coarse.to(fine.dtype)
@@ -48,13 +56,21 @@ def upsample_add(pyramid: Pyramid, coarse: Tensor, fine: Tensor, *, clamped: boo
     return pyramid.up(coarse, size) + fine
 
 
-def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
+def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int], sizes: Sizes | None = None) -> Tensor:
     """Return Up(coarse) of size (h, w), equal to `pyramid.up(coarse, size)` up to rounding, with its gradient.
+
+    Args:
+        coarse: as `upsample_add` takes it.
+        size: (h, w) of the result.
+        sizes: as `upsample_add` takes them.
 
     Raises:
         UserInputError: the image is not half of `size`.
     """
     require_half(coarse, size)
+    if sizes is not None:
+        pairs = zip(_halves(coarse, sizes), sizes, strict=True)
+        return stack_padded([upsample(pyramid, image, (height, width)) for image, (width, height) in pairs])
     if _fits_numba(coarse) and not are_differentiated(coarse):
         from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
 
@@ -64,6 +80,11 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
     from lapgs_plugin.ops.upsample.in_triton import upsample_triton
 
     return upsample_triton(pyramid, coarse, size)
+
+
+def _halves(coarse: Tensor, sizes: Sizes) -> list[Tensor]:
+    """Return the own part of each coarse image, half of that of fine ones."""
+    return own_parts(coarse, [level_size(size, 1) for size in sizes])
 
 
 def are_differentiated(*images: Tensor) -> bool:

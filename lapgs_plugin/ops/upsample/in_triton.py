@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, transposed_taps
 from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
+from lapgs_plugin.ops.mixed_sizes import Sizes
 from lapgs_plugin.ops.upsample import are_differentiated
 
 BLOCK = 128
@@ -26,7 +27,7 @@ MOST_TRANSPOSED = 12
 # Triton compiles a kernel again for integers that are 1 or multiples of 16. Without this it would do so for many image
 # sizes.
 OF_ANY_VALUE = (
-    *("height", "width", "rows", "source_image", "source_plane", "source_row"),
+    *("height", "width", "rows", "first_image", "source_image", "source_plane", "source_row"),
     *("added_image", "added_plane", "added_row", "out_image", "out_plane", "out_row"),
 )
 
@@ -44,7 +45,7 @@ def _across(row: tl.tensor, stride: int, weights: tl.tuple, inside: tl.tensor, t
 def _kernel(
     source: tl.tensor, added: tl.tensor, out: tl.tensor,
     first_row: tl.tensor, row_weights: tl.tensor, first_column: tl.tensor, column_weights: tl.tensor,
-    height: int, width: int, rows: int,
+    height: int, width: int, rows: int, first_image: int,
     source_image: int, source_plane: int, source_row: int, added_image: int, added_plane: int, added_row: int,
     out_image: int, out_plane: int, out_row: int,
     source_column: tl.constexpr, added_column: tl.constexpr, out_column: tl.constexpr,
@@ -60,7 +61,7 @@ def _kernel(
     # Neighbouring threads write neighbouring values.
     column = places // planes if interleaved else places % width
     plane = places % planes if interleaved else places // width
-    image = tl.program_id(2).to(tl.int64)
+    image = (tl.program_id(2) + first_image).to(tl.int64)
     row = tl.program_id(1) * rows
     end = tl.minimum(row + rows, height)
     weights = ()
@@ -99,12 +100,15 @@ class _Taps(NamedTuple):
     weights: Tensor
 
 
-def upsample_add_triton(pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False) -> Tensor:
+def upsample_add_triton(
+    pyramid: Pyramid, coarse: Tensor, fine: Tensor, clamped: bool = False, sizes: Sizes | None = None
+) -> Tensor:
     """Do `upsample_add` for images on a CUDA device, with any strides: float32, or a float16 `coarse`."""
     size = fine.shape[-2], fine.shape[-1]
     if clamped or not are_differentiated(coarse, fine):
-        return _upsampled(pyramid.grid, size, coarse, fine, clamps=clamped)
-    out: Tensor = _Upsampled.apply(coarse, fine, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+        return _upsampled(pyramid.grid, size, coarse, fine, clamps=clamped, sizes=sizes)
+    options = pyramid.grid, size, sizes
+    out: Tensor = _Upsampled.apply(coarse, fine, *options)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
@@ -112,53 +116,78 @@ def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> 
     """Do `upsample` for a float32 image on a CUDA device, with any strides."""
     if not are_differentiated(coarse):
         return _upsampled(pyramid.grid, size, coarse)
-    out: Tensor = _Upsampled.apply(coarse, None, pyramid.grid, size)  # type: ignore[no-untyped-call]  # torch's
+    options = pyramid.grid, size, None
+    out: Tensor = _Upsampled.apply(coarse, None, *options)  # type: ignore[no-untyped-call]  # torch's
     return out
 
 
 class _Upsampled(torch.autograd.Function):
-    """Map (coarse, fine or None, grid, size) to Up(coarse) + fine; the gradient applies the transpose of Up."""
+    """Map (coarse, fine or None, grid, size, sizes or None) to Up(coarse) + fine.
+
+    The gradient applies the transpose of Up.
+    """
 
     @staticmethod
-    def forward(ctx: Any, coarse: Tensor, fine: Tensor | None, grid: str, size: tuple[int, int]) -> Tensor:
-        ctx.grid, ctx.size, ctx.shape = grid, size, coarse.shape
-        return _upsampled(grid, size, coarse, fine)
+    def forward(
+        ctx: Any, coarse: Tensor, fine: Tensor | None, grid: str, size: tuple[int, int], sizes: Sizes | None
+    ) -> Tensor:
+        ctx.grid, ctx.size, ctx.sizes, ctx.shape = grid, size, sizes, coarse.shape
+        return _upsampled(grid, size, coarse, fine, sizes=sizes)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         by_fine = gradient if ctx.needs_input_grad[1] else None
         if not ctx.needs_input_grad[0]:
-            return None, by_fine, None, None
-        out = gradient.new_empty(ctx.shape)
-        rows, columns = (_up_transposed(ctx.grid, side, gradient.device) for side in ctx.size)
-        _filter(gradient, rows, columns, out)
-        return out, by_fine, None, None
+            return None, by_fine, None, None, None
+        if ctx.sizes is None:
+            out = gradient.new_empty(ctx.shape)
+            _filter(gradient, ctx.grid, ctx.size, out, transposed=True)
+        else:
+            out = gradient.new_zeros(ctx.shape)
+            for index, (width, height) in enumerate(ctx.sizes):
+                _filter(gradient, ctx.grid, (height, width), out, transposed=True, only=index)
+        return out, by_fine, None, None, None
 
 
 def _upsampled(
-    grid: str, size: tuple[int, int], coarse: Tensor, fine: Tensor | None = None, *, clamps: bool = False
-) -> Tensor:
+    grid: str, size: tuple[int, int], coarse: Tensor, fine: Tensor | None = None, *, clamps: bool = False,
+    sizes: Sizes | None = None,
+) -> Tensor:  # fmt: skip
     """Return Up(coarse) + fine of this size, without a gradient."""
     out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
-    rows, columns = (_up(grid, side, coarse.device) for side in size)
-    _filter(coarse, rows, columns, out, fine, clamps=clamps)
+    if sizes is None:
+        _filter(coarse, grid, size, out, fine, clamps=clamps)
+        return out
+    out.zero_()  # numbers beyond the images are finite, so that zero times them is zero
+    for index, (width, height) in enumerate(sizes):
+        _filter(coarse, grid, (height, width), out, fine, clamps=clamps, only=index)
     return out
 
 
 def _filter(
-    source: Tensor, rows: _Taps, columns: _Taps, out: Tensor, added: Tensor | None = None, *, clamps: bool = False
-) -> None:
-    """Write weighted sums of `source`, plus `added` if given, to `out`; clamped to [0, 1] if asked for."""
+    source: Tensor, grid: str, size: tuple[int, int], out: Tensor, added: Tensor | None = None, *,
+    clamps: bool = False, transposed: bool = False, only: int | None = None,
+) -> None:  # fmt: skip
+    """Write weighted sums of `source`, plus `added` if given, to `out`; clamped to [0, 1] if asked for.
+
+    Args:
+        size: (h, w) of fine images; with `transposed` these are the source.
+        transposed: the sums are those of the gradient.
+        only: number of the image to filter, in its top left part; None filters all. Taps depend on the size.
+    """
     tensors = (source, out if added is None else added, out)
     images = [image if image.ndim == 4 else image[None] for image in tensors]  # (b, c, ..., ...) each
-    b, planes, height, width = images[2].shape
+    taps = _up_transposed if transposed else _up
+    rows, columns = (taps(grid, side, source.device) for side in size)
+    b, planes = (images[2].shape[0] if only is None else 1), images[2].shape[1]
+    height, width = len(rows.first), len(columns.first)
     strips = blocks(planes * width, BLOCK)
     count = rows_of_program(height, strips * b, LEAST_ROWS)
     source_column, added_column, out_column = (image.stride(3) for image in images)
     launch(
         _kernel, (strips, blocks(height, count), b),
-        *images, *rows, *columns, height, width, count,
+        *images, *rows, *columns, height, width, count, only or 0,
         *(stride for image in images for stride in image.stride()[:3]),
         source_column=source_column, added_column=added_column, out_column=out_column,
         adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
@@ -166,13 +195,13 @@ def _filter(
     )  # fmt: skip
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 @torch.inference_mode(False)  # the cache serves calls that need gradients
 def _up(grid: str, size: int, device: torch.device) -> _Taps:
     return _to_device(*Pyramid(grid).up_taps(size), (size + 1) // 2, MOST_TAPS, device)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 @torch.inference_mode(False)  # the cache serves calls that need gradients
 def _up_transposed(grid: str, size: int, device: torch.device) -> _Taps:
     return _to_device(*transposed_taps(*Pyramid(grid).up_taps(size), (size + 1) // 2), size, MOST_TRANSPOSED, device)

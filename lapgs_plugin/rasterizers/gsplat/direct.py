@@ -1,4 +1,4 @@
-"""Render one view, or several of one size, by our kernels.
+"""Render one view, or several, by our kernels.
 
 `gsplat.rasterization` is a chain of five differentiable functions with PyTorch operations between them. For small
 images its launches take more time than its kernels. Here a render is one autograd node: our kernels project
@@ -116,7 +116,7 @@ class _Render(torch.autograd.Function):
         parameters = Parameters(means, quaternions, log_scales, logits, sh)
         seen, tiles, blended = forward(parameters, cameras, background, degree, signed, with_geometry)
         ctx.save_for_backward(*parameters, *cameras[:3], seen.radii, seen.records, *tiles, *blended)
-        ctx.size, ctx.degree, ctx.signed = (cameras.width, cameras.height), degree, signed
+        ctx.sizes, ctx.degree, ctx.signed = cameras[3:], degree, signed
         ctx.absgrad, ctx.targets = absgrad, targets
         box.append(seen)
         return _channels_first(blended[0])
@@ -128,7 +128,7 @@ class _Render(torch.autograd.Function):
         from lapgs_plugin.gpu_raster.kernels import project_backward
 
         saved = ctx.saved_tensors
-        parameters, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.size)
+        parameters, cameras = Parameters(*saved[:5]), DeviceCameras(*saved[5:8], *ctx.sizes)
         radii, records, offsets, flat, images, counts, words = saved[8:]
         by_images = by_image.movedim(-3, -1).contiguous().view(images.shape)
         by_records, others = blend_backward(records, offsets, flat, images, counts, words, by_images, ctx.absgrad)

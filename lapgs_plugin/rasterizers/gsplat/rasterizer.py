@@ -30,6 +30,7 @@ from lapgs_plugin.fields.rasterizer import (
 )
 from lapgs_plugin.gpu_raster.cameras import CameraCache
 from lapgs_plugin.gpu_raster.records import RECORD
+from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.rasterizers.gsplat import direct
 from lapgs_plugin.rasterizers.gsplat.direct_stack import DirectStack
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
@@ -159,6 +160,11 @@ class GsplatRasterizer(Rasterizer):
         """See `fields.rasterizer.Rasterizer`. Packed results have no row for each camera and Gaussian."""
         return self._device.type == "cuda" and not self._stock.packed
 
+    @property
+    def mixes_sizes(self) -> bool:
+        """See `fields.rasterizer.Rasterizer`. gsplat's functions cull all Gaussians by one size, our kernels do not."""
+        return self._may_be_direct and (self._must_be_direct or direct_works())
+
     def render_batch(
         self,
         field: GaussianField,
@@ -215,7 +221,7 @@ class GsplatRasterizer(Rasterizer):
     def _render(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, sh_degree: int | None
     ) -> RenderResult:
-        """Render cameras of one size with radii and centres."""
+        """Render cameras with radii and centres."""
         require_color(background)
         degree, absgrad = degree_to_evaluate(field, sh_degree), self._absgrad
         if len(field) == 0:
@@ -245,11 +251,11 @@ def _without_gaussians(
 ) -> RenderResult:
     """Return the result for a field of no Gaussians: the background."""
     leading, means = (len(cameras),) if len(cameras) > 1 else (), field.means
-    size = cameras[0].height, cameras[0].width
+    width, height = largest_size([camera.size for camera in cameras])
     means2d = means.new_zeros(*leading, 0, 2).requires_grad_(is_differentiated(field))
     absgrad2d = means.new_zeros(*leading, 0, 2) if means2d.requires_grad and absgrad else None
     # Zero, but in the graph: a loss of the image can be differentiated by the empty parameters.
     nothing = torch.cat([value.flatten() for value in (means2d, *field.parameters.values())]).sum()
-    image = (background.to(means) + nothing)[:, None, None].expand(*leading, 3, *size)
-    transmittance = None if leading else means.new_ones(size)
+    image = (background.to(means) + nothing)[:, None, None].expand(*leading, 3, height, width)
+    transmittance = None if leading else means.new_ones(height, width)
     return RenderResult(image, transmittance, means2d.detach()[..., 0].int(), means2d, absgrad2d)

@@ -16,6 +16,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.gpu_raster.cameras import cameras_on_device
+from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import footprint_radii
 
@@ -35,7 +36,9 @@ class StockRasterization:
     def render(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, *, absgrad: bool
     ) -> RenderResult:
-        """Render cameras of one size; tensors of the result have a leading dimension for several, not for one.
+        """Render cameras; tensors of the result have a leading dimension for several, not for one.
+
+        Those of several sizes are rendered as large as the largest.
 
         Args:
             field, cameras, background: as a rasterizer takes them.
@@ -80,8 +83,7 @@ class StockRasterization:
             colors,
             viewmats,
             intrinsics,
-            cameras[0].width,
-            cameras[0].height,
+            *largest_size([camera.size for camera in cameras]),
             near_plane=NEAR_DEPTH,
             eps2d=PIXEL_VARIANCE,
             radius_clip=0.0,
