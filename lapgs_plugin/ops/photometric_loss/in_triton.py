@@ -52,7 +52,7 @@ def _own_size(
     """Return an image's width and height, and the weights of one of its pixels."""
     if mixed:
         width, height = tl.load(size), tl.load(size + 1)
-        pixels = width.to(tl.float32) * height.to(tl.float32)
+        pixels = 1.0 * width * height
         l1_weight, ssim_weight = l1_weight / pixels, ssim_weight / pixels
     return width, height, l1_weight, ssim_weight
 
