@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.ops.mixed_sizes import own_parts, stack_padded
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.rasterizers.gsplat.self_check import direct_works
 from lapgs_plugin.runs.archive import RunArchive
@@ -127,12 +128,18 @@ def test_nothing_is_kept_of_renders_that_nobody_differentiates() -> None:
         gc.enable()
 
 
-@pytest.mark.parametrize("views", [2, 5, 8])
+@pytest.mark.parametrize(("views", "less"), [(2, 0), (5, 0), (8, 0), (2, 3), (8, 3)])
 @pytest.mark.parametrize(("degree", "active", "signed"), [(3, 3, False), (3, 1, True), (0, 0, False)])
-def test_several_views_are_those_of_single_calls(views: int, degree: int, active: int, signed: bool) -> None:
+def test_several_views_are_those_of_single_calls(views: int, less: int, degree: int, active: int, signed: bool) -> None:
+    """Of one size, and of sizes with up to `less` columns and rows less."""
     background = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     weights = torch.randn(views, 3, CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(5)).cuda()
-    cameras = [moved(0.1 * index) for index in range(views)]
+    cameras = [
+        replace(moved(0.1 * index), width=CAMERA.width - min(index, less), height=CAMERA.height - min(index // 2, less))
+        for index in range(views)
+    ]
+    inside = stack_padded([torch.ones(1, camera.height, camera.width, device="cuda") for camera in cameras])
+    weights *= inside
     rasterizer = GsplatRasterizer(direct=True, own_radii=True)
     together, alone = gaussians(degree, signed), gaussians(degree, signed)
     for value in (*together.parameters.values(), *alone.parameters.values()):
@@ -140,9 +147,10 @@ def test_several_views_are_those_of_single_calls(views: int, degree: int, active
     batch = rasterizer.render_batch(together, cameras, background=background, sh_degree=active)
     (batch.image * weights).sum().backward()
     singles = [rasterizer(alone, camera, background=background, sh_degree=active) for camera in cameras]
-    torch.stack([(one.image * weight).sum() for one, weight in zip(singles, weights, strict=True)]).sum().backward()
+    own = own_parts(weights, [camera.size for camera in cameras])
+    torch.stack([(one.image * weight).sum() for one, weight in zip(singles, own, strict=True)]).sum().backward()
     pairs = {
-        "image": (batch.image.detach(), torch.stack([one.image.detach() for one in singles])),
+        "image": (batch.image.detach() * inside, stack_padded([one.image.detach() for one in singles])),
         "radii": (batch.radii.float(), torch.stack([one.radii for one in singles]).float()),
         "means2d": (batch.means2d.detach(), torch.stack([one.means2d.detach() for one in singles])),
         "by means2d": (batch.means2d.grad, torch.stack([one.means2d.grad for one in singles])),

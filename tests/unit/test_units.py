@@ -166,7 +166,7 @@ def test_batches_and_stacks_are_scaled_too() -> None:
     seen: list[Any] = []
 
     class Recording(CpuRasterizer):
-        can_batch = can_stack = True
+        can_batch = mixes_sizes = can_stack = True
 
         def render_batch(self, field: GaussianField, cameras: Any, **_: Any) -> RenderResult:
             seen.append((field, *cameras))
@@ -178,6 +178,7 @@ def test_batches_and_stacks_are_scaled_too() -> None:
 
     rasterizer: Rasterizer = in_unit(Recording(), 4.0)
     assert rasterizer.can_batch
+    assert rasterizer.mixes_sizes
     assert rasterizer.can_stack
     field, camera = blob_field(5), ring_camera(0.0)
     rasterizer.render_batch(field, [camera, camera], background=BLACK)
