@@ -23,9 +23,9 @@ from torch import Tensor
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
-from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
+from lapgs_plugin.runner.visible_rows import VisibleRows
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class _RendererCall:
         key: key of the view; None for other cameras.
         location: file and line of the call.
         values: numbers of each Gaussian (n, k) among its arguments, such as colours to render instead.
+        by_mask: whether the caller needs no indices of visible Gaussians.
         done: not empty once the model's colours were rasterized.
     """
 
@@ -44,6 +45,7 @@ class _RendererCall:
     key: str | None = None
     location: str = "the checkout"
     values: tuple[Tensor, ...] = ()
+    by_mask: bool = False
     done: list[bool] = field(default_factory=list)
 
 
@@ -53,11 +55,11 @@ class RasterizerWrapper:
     Args:
         stages: say how images are rendered.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
-        visibility: finds visible Gaussians early; None leaves it to the renderers.
+        rows: how visible Gaussians are listed and their statistics updated; None leaves it to the checkout.
         ours: our modules, by full name, that may render in place of the checkout's rasterizer, with its settings.
 
     Attributes:
-        visibility: as given.
+        rows: as given.
         takes_ours: whether they do.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
@@ -66,10 +68,10 @@ class RasterizerWrapper:
         self,
         stages: Stages,
         mark: Callable[[str], None] = lambda part: None,
-        visibility: EarlyVisibility | None = None,
+        rows: VisibleRows | None = None,
         ours: Mapping[str, ModuleType] | None = None,
     ) -> None:
-        self._stages, self._mark, self.visibility = stages, mark, visibility
+        self._stages, self._mark, self.rows = stages, mark, rows
         self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
@@ -79,7 +81,8 @@ class RasterizerWrapper:
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
-        renderer = original if self.visibility is None else self.visibility.in_renderer(original)
+        rows = self.rows
+        renderer = original if rows is None else rows.in_renderer(original, lambda: self.running.by_mask)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
@@ -87,11 +90,12 @@ class RasterizerWrapper:
             key = next((key for v in arguments if (key := view_key(v)) is not None), outer.key)
             values = tuple(v for v in arguments if isinstance(v, Tensor) and v.ndim == 2)
             way = original, any(getattr(v, "convert_SHs_python", False) is True for v in arguments)
-            location = outer.location
+            location, by_mask = outer.location, False
             if outer.way is None:
                 caller = sys._getframe(1)
                 location = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
-            self.running = _RendererCall(way, key, location, (*outer.values, *values))
+                by_mask = rows is not None and rows.is_for_masks(caller.f_code)
+            self.running = _RendererCall(way, key, location, (*outer.values, *values), by_mask)
             try:
                 return renderer(*args, **kwargs)
             finally:
@@ -174,8 +178,6 @@ class RasterizerWrapper:
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
             def marked(**inputs: Any) -> Any:
                 outputs = rasterizer(**inputs)
-                if self.visibility is not None:
-                    self.visibility.note(outputs)
                 self._mark("loss")
                 return outputs
 

@@ -200,6 +200,41 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
             torch.testing.assert_close(gradient, gradients[0], rtol=0, atol=1e-5)
 """
 
+ROWS = """
+import torch
+from lapgs_plugin.ops.masked_updates import triton_works
+from lapgs_plugin.ops.masked_updates.in_torch import Update, update_rows_torch
+from lapgs_plugin.ops.masked_updates.in_triton import update_rows_triton
+
+def norm(points):  # each operation rounds once, as PyTorch's norm does on a GPU; its square root on a CPU may be off
+    squares = points[:, :1] * points[:, :1] + points[:, 1:] * points[:, 1:]
+    return squares.double().sqrt().float()
+
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 511, 1500):
+    rows, wide = torch.randn(n, 1), torch.randn(n, 4)
+    rows[::7], rows[1::7], wide[::5, 2] = torch.nan, torch.inf, torch.nan
+    mask, whole = torch.rand(n) > 0.4, torch.randint(0, 9, (n, 1)).int()
+    first, last = norm(wide[:, :2]), norm(wide[:, 2:])
+    cases = [
+        (True, rows), (False, 1), (True, 0.1), (False, whole), (False, rows, None, whole),
+        (False, wide, (None, 2)), (True, wide, (2, None), rows), (False, wide, (2, 4), whole),
+    ]
+    plain = [*cases[:5], (False, first), (True, last, None, rows), (False, last, None, whole)]
+    targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(8)]
+                         for _ in range(2))
+    update_rows_triton(mask, [Update(target, *case) for target, case in zip(targets, cases)])
+    for target, case in zip(expected, plain):
+        value = case[1] * case[3] if len(case) > 3 else case[1]
+        after = torch.maximum(target, torch.as_tensor(value)) if case[0] else target + value
+        target[mask] = after[mask]
+    for one, other in zip(targets, expected):
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+if DEVICE == "cuda":
+    assert triton_works.difference(torch.device("cuda")) == 0.0
+"""
+
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
     command = [sys.executable, "-c", f"DEVICE = {device!r}\n{checks}"]
@@ -208,11 +243,12 @@ def run_checks(checks: str, device: str, **environment: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE], ids=["all", "noise", "upsample"])
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS], ids=["all", "noise", "upsample", "rows"])
 def test_interpreted(checks: str) -> None:
     run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
 
 @pytest.mark.gpu
-def test_compiled() -> None:
-    run_checks(CHECKS, "cuda")
+@pytest.mark.parametrize("checks", [CHECKS, ROWS], ids=["all", "rows"])
+def test_compiled(checks: str) -> None:
+    run_checks(checks, "cuda")
