@@ -23,6 +23,10 @@ from torch import Tensor
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
+from lapgs_plugin.checkouts.rewriting import rewritten
+from lapgs_plugin.checkouts.whole_sh import SH, WHOLE, WholeSh, joined_attributes
+from lapgs_plugin.family.binding import Rasterizer
+from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
 from lapgs_plugin.runner.visible_rows import VisibleRows
@@ -75,6 +79,8 @@ class RasterizerWrapper:
         self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
+        self._take_parts: dict[bool, bool] = {}  # by whether ours renders: whether the rasterizers take `ShParts`
+        self._parts: dict[type, tuple[str, str] | None] = {}
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
         # probe of signed colour find them before a stage trains.
         self._ways_of_sh: set[Any] = set()
@@ -82,7 +88,8 @@ class RasterizerWrapper:
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
         rows = self.rows
-        renderer = original if rows is None else rows.in_renderer(original, lambda: self.running.by_mask)
+        renderer = rewritten(original, WholeSh, {SH: self._sh})
+        renderer = renderer if rows is None else rows.in_renderer(renderer, lambda: self.running.by_mask)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
@@ -112,6 +119,12 @@ class RasterizerWrapper:
             ours = self._ours.get(rasterizer.use.module) if compared else None
             for name in rasterizer.settings:
                 makers += [(holder, self.settings) for holder in profile.rasterizer_holders(rasterizer, name)]
+            if compared:
+                pairs = [(vars(rasterizer.module)[name], getattr(ours, name, None)) for name in rasterizer.entries]
+                self._take_parts = {
+                    taking: all(map(_takes_parts, [(taking and our) or own for own, our in pairs]))
+                    for taking in (False, True)
+                }
             for name in rasterizer.entries:
                 kind = self.wrap_class if inspect.isclass(vars(rasterizer.module)[name]) else self.wrap_function
                 make = partial(kind, ours=getattr(ours, name, None))
@@ -181,17 +194,33 @@ class RasterizerWrapper:
                 self._mark("loss")
                 return outputs
 
+            if isinstance(parts := inputs.get("shs"), ShParts) and not _takes_parts(type(rasterizer)):
+                inputs = {**inputs, "shs": parts.whole}
             if not _has_model_colors(inputs, running, self._ways_of_sh):
                 return rendering.render_other(marked, inputs, settings, running.location)
             return rendering.render(marked, inputs, settings, running.key, running.location)
 
         return call
 
+    def _sh(self, model: Any) -> Any:
+        """Return the SH coefficients of a model for a rasterizer, in two parts if it takes them."""
+        kind, rendering = type(model), self._stages.rendering
+        if kind not in self._parts:
+            self._parts[kind] = joined_attributes(kind)
+        names = self._parts[kind]
+        if names is None or rendering is None or not self._take_parts.get(self.takes_ours) or not rendering.takes_parts:
+            return getattr(model, WHOLE)
+        return ShParts(getattr(model, names[0]), getattr(model, names[1]))
+
     def _zero_background(self, like: Tensor) -> Tensor:
         """Return (3,) zeros on the device of a background, the same ones in every call."""
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+def _takes_parts(rasterizer: Any) -> bool:
+    return inspect.isclass(rasterizer) and issubclass(rasterizer, Rasterizer)
 
 
 def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, ways_of_sh: set[Any]) -> bool:

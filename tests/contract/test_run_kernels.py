@@ -9,11 +9,14 @@ import pytest
 import torch
 
 from lapgs_plugin.checkouts.logged_numbers import READ
+from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
 from lapgs_plugin.ops.masked_updates import update_rows
 from lapgs_plugin.runner import checkout_ssim, late_numbers, visible_rows
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_model import StageModel
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from tests.contract.stub_runs import (
     FORKS,
     HALF,
@@ -110,6 +113,32 @@ def test_visible_gaussians(name: str, scene: Path, tmp_path: Path, monkeypatch: 
         fields.append([archive.field(level) for level in (1, 0)])
     assert updated
     assert all(updated)
+    for ours, plain in zip(*fields, strict=True):
+        assert torch.equal(ours.means, plain.means)
+        assert torch.equal(ours.sh, plain.sh)
+
+
+@pytest.mark.parametrize("name", ["dash", "mini"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_sh_in_parts(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are joined by nobody where our rasterizer renders, and the field is the same to the bit."""
+    parts: list[bool] = []
+    sh_of = RasterizerWrapper._sh
+
+    def counted(wrapper: RasterizerWrapper, model: Any) -> Any:
+        sh = sh_of(wrapper, model)
+        parts.append(isinstance(sh, ShParts))
+        return sh
+
+    monkeypatch.setattr(RasterizerWrapper, "_sh", counted)
+    fields = []
+    for apart in (True, False):
+        if not apart:
+            monkeypatch.setattr(StageRendering, "takes_parts", False)
+        archive, _ = run_hierarchy(FORKS[name], scene, tmp_path / str(apart), *SHORT, hierarchy=kind)
+        fields.append([archive.field(level) for level in (1, 0)])
+        assert any(parts) == apart
+        parts.clear()
     for ours, plain in zip(*fields, strict=True):
         assert torch.equal(ours.means, plain.means)
         assert torch.equal(ours.sh, plain.sh)
