@@ -235,6 +235,27 @@ if DEVICE == "cuda":
     assert triton_works.difference(torch.device("cuda")) == 0.0
 """
 
+QUATERNIONS = """
+import torch
+from torch.nn.functional import normalize
+from lapgs_plugin.ops.unit_quaternions.in_triton import unit_quaternions_triton
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 255, 700):
+    values, weights = torch.randn(n, 4), torch.randn(n, 4)
+    values[::9], values[1::9] = 0.0, 1e-20
+    results = []
+    for operation, kind in ((unit_quaternions_triton, torch.float32), (normalize, torch.float64)):
+        leaf = values.to(kind).requires_grad_()
+        units = operation(leaf)
+        results.append((units.double(), torch.autograd.grad((units * weights).sum(), leaf)[0].double()))
+    for one, other in zip(*results):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    assert (results[0][0].norm(dim=1) - 1).abs()[2::9].amax() < 1e-6 if n > 2 else True
+"""
+
+NAMES = ["all", "noise", "upsample", "rows", "quaternions"]
+
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
     command = [sys.executable, "-c", f"DEVICE = {device!r}\n{checks}"]
@@ -243,12 +264,12 @@ def run_checks(checks: str, device: str, **environment: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS], ids=["all", "noise", "upsample", "rows"])
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS, QUATERNIONS], ids=NAMES)
 def test_interpreted(checks: str) -> None:
     run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("checks", [CHECKS, ROWS], ids=["all", "rows"])
+@pytest.mark.parametrize("checks", [CHECKS, ROWS, QUATERNIONS], ids=["all", "rows", "quaternions"])
 def test_compiled(checks: str) -> None:
     run_checks(checks, "cuda")
