@@ -12,7 +12,7 @@ from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import checkout_ssim
+from lapgs_plugin.runner import checkout_rotations, checkout_ssim
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
@@ -71,6 +71,7 @@ class StageReplacements:
             *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
             *self._in_losses(profile),
+            *self._in_rotations(profile),
             *parts.replacements(profile, adapter.info),
         ]
 
@@ -125,6 +126,13 @@ class StageReplacements:
             return []
         holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
         return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
+
+    @staticmethod
+    def _in_rotations(profile: Profile) -> list[Replacement]:
+        """Return the replacement of the function that makes scaled rotations, if the script itself calls it."""
+        script, name = profile.script.module, checkout_rotations.NAME
+        replacement = Replacement(script, name, checkout_rotations.in_our_kernel, "training() in its noise")
+        return [replacement] if inspect.isfunction(vars(script).get(name)) else []
 
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""

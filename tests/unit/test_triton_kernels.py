@@ -253,8 +253,19 @@ for n in (1, 255, 700):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
     assert (results[0][0].norm(dim=1) - 1).abs()[2::9].amax() < 1e-6 if n > 2 else True
 """
+ROTATIONS = """
+import torch
+from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
+from lapgs_plugin.ops.scaled_rotations.in_triton import scaled_rotations_triton
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 700):
+    scales, quaternions = 4 * torch.rand(n, 3), torch.randn(n, 4)
+    expected = scaled_rotations_torch(scales.double(), quaternions.double()).float()
+    torch.testing.assert_close(scaled_rotations_triton(scales, quaternions), expected, rtol=0, atol=4e-6)
+"""
 
-NAMES = ["all", "noise", "upsample", "rows", "quaternions"]
+NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations"]
 
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
@@ -264,12 +275,12 @@ def run_checks(checks: str, device: str, **environment: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS, QUATERNIONS], ids=NAMES)
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS, QUATERNIONS, ROTATIONS], ids=NAMES)
 def test_interpreted(checks: str) -> None:
     run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("checks", [CHECKS, ROWS, QUATERNIONS], ids=["all", "rows", "quaternions"])
+@pytest.mark.parametrize("checks", [CHECKS, ROWS, QUATERNIONS, ROTATIONS], ids=["all", *NAMES[3:]])
 def test_compiled(checks: str) -> None:
     run_checks(checks, "cuda")
