@@ -141,6 +141,6 @@ def _scale_sh_rate(optimizers: Sequence[torch.optim.Optimizer], factor: float) -
 
 
 def fuse_rotations(gaussians: Any) -> None:
-    """Let a checkout's model normalise quaternions in our kernels if it does by PyTorch's function, in 16 launches."""
+    """Let a checkout's model normalise quaternions in our kernels, if it does in PyTorch's 17 operations."""
     if getattr(gaussians, ROTATION, None) is normalize:
         setattr(gaussians, ROTATION, unit_quaternions)
