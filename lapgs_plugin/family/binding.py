@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from torch import Tensor, nn
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.family.call import Inputs, Settings
+from lapgs_plugin.family.call import Inputs, Settings, ShParts
 from lapgs_plugin.family.engine import mark_visible, rasterize
 
 if TYPE_CHECKING:
@@ -78,13 +78,13 @@ def gather(
     means2D: Tensor,
     opacities: Tensor,
     dc: Tensor | None = None,
-    shs: Tensor | None = None,
+    shs: Tensor | ShParts | None = None,
     colors_precomp: Tensor | None = None,
     scales: Tensor | None = None,
     rotations: Tensor | None = None,
     cov3D_precomp: Tensor | None = None,
 ) -> Inputs:
-    """Return a binding's arguments as `Inputs`.
+    """Return a binding's arguments as `Inputs`; `shs` may be `ShParts`, whatever its type says to checkouts.
 
     Raises:
         UserInputError: not exactly one of SH and colours, or of scales with rotations and covariances.
@@ -96,5 +96,7 @@ def gather(
         raise UserInputError(
             "got both or neither of scales with rotations and cov3D_precomp: expected exactly one of them"
         )
+    if isinstance(shs, ShParts):
+        dc, shs = shs
     dc = None if shs is None else dc
     return Inputs(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from lapgs_plugin.reference_raster.layout import PIXEL_VARIANCE
@@ -24,6 +25,23 @@ class Settings(Protocol):
     projmatrix: Tensor
     sh_degree: int
     campos: Tensor
+
+
+class ShParts(NamedTuple):
+    """Take the place of a binding's argument `shs`, (n, k, 3), where joining it would be work for nothing else.
+
+    Attributes:
+        dc: (n, 1, 3).
+        rest: (n, k - 1, 3).
+    """
+
+    dc: Tensor
+    rest: Tensor
+
+    @property
+    def whole(self) -> Tensor:
+        """All coefficients, (n, k, 3)."""
+        return torch.cat([self.dc, self.rest], dim=1)
 
 
 class Inputs(NamedTuple):

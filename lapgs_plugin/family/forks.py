@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
-from lapgs_plugin.family.call import Blending, Inputs, Options, Output, depths_of
+from lapgs_plugin.family.call import Blending, Inputs, Options, Output, ShParts, depths_of
 from lapgs_plugin.family.engine import rasterize
 from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
@@ -269,6 +269,8 @@ class EfficientGS(Rasterizer):
         if settings.use_train_speedup:
             raise UserInputError("our version of EfficientGS's rasterizer has no --use_train_speedup; leave it out")
         if shs is not None and sparse_shs_degree is not None and len(sparse_shs_degree):
+            if isinstance(shs, ShParts):
+                shs = shs.whole
             degrees = torch.arange(shs.shape[1], device=shs.device).sqrt().floor()  # of each coefficient
             shs = shs * (degrees <= sparse_shs_degree[:, None])[:, :, None]
         inputs = gather(means3D, means2D, opacities, None, shs, colors_precomp, scales, rotations, cov3D_precomp)

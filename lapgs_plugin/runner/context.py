@@ -26,13 +26,13 @@ from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.archived_values import ADAPTER_MENDS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
-from lapgs_plugin.runner.early_visibility import EarlyVisibility
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
+from lapgs_plugin.runner.visible_rows import VisibleRows
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.runs.watcher import Watcher
@@ -84,9 +84,9 @@ class CheckoutContext:
         self.request, self.adapter, self.device = request, request.adapter, torch.device(request.device)
         self.images, self.stages = SceneImages(), Stages()
         self.parts = IterationParts(self.stages, request.measuring.breakdown)
-        visibility = EarlyVisibility() if request.settings.run_ahead else None
+        rows = VisibleRows() if request.settings.run_ahead else None
         ours = {} if request.compiled is None else request.compiled.beside
-        self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, visibility, ours)
+        self.wrapper = RasterizerWrapper(self.stages, self.parts.mark_render, rows, ours)
         self.hooks = HookCaller(self.stages, request.hooks, request.settings.hooks)
         with tempfile.TemporaryFile() as file:  # its clock is behind `time.time_ns`
             self.began = os.fstat(file.fileno()).st_mtime_ns

@@ -23,9 +23,13 @@ from torch import Tensor
 from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
-from lapgs_plugin.runner.early_visibility import EarlyVisibility
+from lapgs_plugin.checkouts.rewriting import rewritten
+from lapgs_plugin.checkouts.whole_sh import SH, WHOLE, WholeSh, joined_attributes
+from lapgs_plugin.family.binding import Rasterizer
+from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
+from lapgs_plugin.runner.visible_rows import VisibleRows
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class _RendererCall:
         key: key of the view; None for other cameras.
         location: file and line of the call.
         values: numbers of each Gaussian (n, k) among its arguments, such as colours to render instead.
+        by_mask: whether the caller needs no indices of visible Gaussians.
         done: not empty once the model's colours were rasterized.
     """
 
@@ -44,6 +49,7 @@ class _RendererCall:
     key: str | None = None
     location: str = "the checkout"
     values: tuple[Tensor, ...] = ()
+    by_mask: bool = False
     done: list[bool] = field(default_factory=list)
 
 
@@ -53,11 +59,11 @@ class RasterizerWrapper:
     Args:
         stages: say how images are rendered.
         mark: called with "forward" when settings are made, and with "loss" when an image is rasterized.
-        visibility: finds visible Gaussians early; None leaves it to the renderers.
+        rows: how visible Gaussians are listed and their statistics updated; None leaves it to the checkout.
         ours: our modules, by full name, that may render in place of the checkout's rasterizer, with its settings.
 
     Attributes:
-        visibility: as given.
+        rows: as given.
         takes_ours: whether they do.
         running: the renderer's call that is running; outside of the renderers one of no view.
     """
@@ -66,20 +72,24 @@ class RasterizerWrapper:
         self,
         stages: Stages,
         mark: Callable[[str], None] = lambda part: None,
-        visibility: EarlyVisibility | None = None,
+        rows: VisibleRows | None = None,
         ours: Mapping[str, ModuleType] | None = None,
     ) -> None:
-        self._stages, self._mark, self.visibility = stages, mark, visibility
+        self._stages, self._mark, self.rows = stages, mark, rows
         self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
+        self._take_parts: dict[bool, bool] = {}  # by whether ours renders: whether the rasterizers take `ShParts`
+        self._parts: dict[type, tuple[str, str] | None] = {}
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
         # probe of signed colour find them before a stage trains.
         self._ways_of_sh: set[Any] = set()
 
     def renderer(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of a function that renders a view."""
-        renderer = original if self.visibility is None else self.visibility.in_renderer(original)
+        rows = self.rows
+        renderer = rewritten(original, WholeSh, {SH: self._sh})
+        renderer = renderer if rows is None else rows.in_renderer(renderer, lambda: self.running.by_mask)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
@@ -87,11 +97,12 @@ class RasterizerWrapper:
             key = next((key for v in arguments if (key := view_key(v)) is not None), outer.key)
             values = tuple(v for v in arguments if isinstance(v, Tensor) and v.ndim == 2)
             way = original, any(getattr(v, "convert_SHs_python", False) is True for v in arguments)
-            location = outer.location
+            location, by_mask = outer.location, False
             if outer.way is None:
                 caller = sys._getframe(1)
                 location = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
-            self.running = _RendererCall(way, key, location, (*outer.values, *values))
+                by_mask = rows is not None and rows.is_for_masks(caller.f_code)
+            self.running = _RendererCall(way, key, location, (*outer.values, *values), by_mask)
             try:
                 return renderer(*args, **kwargs)
             finally:
@@ -108,6 +119,12 @@ class RasterizerWrapper:
             ours = self._ours.get(rasterizer.use.module) if compared else None
             for name in rasterizer.settings:
                 makers += [(holder, self.settings) for holder in profile.rasterizer_holders(rasterizer, name)]
+            if compared:
+                pairs = [(vars(rasterizer.module)[name], getattr(ours, name, None)) for name in rasterizer.entries]
+                self._take_parts = {
+                    taking: all(map(_takes_parts, [(taking and our) or own for own, our in pairs]))
+                    for taking in (False, True)
+                }
             for name in rasterizer.entries:
                 kind = self.wrap_class if inspect.isclass(vars(rasterizer.module)[name]) else self.wrap_function
                 make = partial(kind, ours=getattr(ours, name, None))
@@ -174,22 +191,36 @@ class RasterizerWrapper:
         def call(rasterizer: Callable[..., Any], inputs: dict[str, Any]) -> Any:
             def marked(**inputs: Any) -> Any:
                 outputs = rasterizer(**inputs)
-                if self.visibility is not None:
-                    self.visibility.note(outputs)
                 self._mark("loss")
                 return outputs
 
+            if isinstance(parts := inputs.get("shs"), ShParts) and not _takes_parts(type(rasterizer)):
+                inputs = {**inputs, "shs": parts.whole}
             if not _has_model_colors(inputs, running, self._ways_of_sh):
                 return rendering.render_other(marked, inputs, settings, running.location)
             return rendering.render(marked, inputs, settings, running.key, running.location)
 
         return call
 
+    def _sh(self, model: Any) -> Any:
+        """Return the SH coefficients of a model for a rasterizer, in two parts if it takes them."""
+        kind, rendering = type(model), self._stages.rendering
+        if kind not in self._parts:
+            self._parts[kind] = joined_attributes(kind)
+        names = self._parts[kind]
+        if names is None or rendering is None or not self._take_parts.get(self.takes_ours) or not rendering.takes_parts:
+            return getattr(model, WHOLE)
+        return ShParts(getattr(model, names[0]), getattr(model, names[1]))
+
     def _zero_background(self, like: Tensor) -> Tensor:
         """Return (3,) zeros on the device of a background, the same ones in every call."""
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+def _takes_parts(rasterizer: Any) -> bool:
+    return inspect.isclass(rasterizer) and issubclass(rasterizer, Rasterizer)
 
 
 def _has_model_colors(inputs: Mapping[str, Any], running: _RendererCall, ways_of_sh: set[Any]) -> bool:

@@ -12,11 +12,12 @@ from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import checkout_ssim
+from lapgs_plugin.runner import checkout_rotations, checkout_ssim
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import timing_replacements
+from lapgs_plugin.runner.visible_rows import VisibleRows
 
 STATISTICS = "add_densification_stats"
 """Method of the family's models that sums gradients of the Gaussians that a view shows."""
@@ -70,6 +71,7 @@ class StageReplacements:
             *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
             *self._in_losses(profile),
+            *self._in_rotations(profile),
             *parts.replacements(profile, adapter.info),
         ]
 
@@ -94,13 +96,22 @@ class StageReplacements:
         if OPACITY_RESET in control:
             control[OPACITY_RESET] = self._make_opacity_reset
         replaced: dict[str, Callable[..., Any]] = {"training_setup": self._make_training_setup, **control}
-        if (visibility := self._context.wrapper.visibility) is not None:
-            replaced[STATISTICS] = visibility.in_statistics
+        if (rows := self._context.wrapper.rows) is not None:
+            self._note_loop(rows, profile)
+            replaced[STATISTICS] = rows.updating
         return [
             replacement
             for name, make in replaced.items()
             for replacement in of_class(profile.model, name, make, "training()")
         ]
+
+    @staticmethod
+    def _note_loop(rows: VisibleRows, profile: Profile) -> None:
+        names = {
+            name for renderer in profile.renderers for name in (*profile.script_names(renderer), renderer.__name__)
+        }
+        statistics = getattr(profile.model, STATISTICS, None)
+        rows.note_loop(profile.training, names, {} if statistics is None else {STATISTICS: statistics})
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""
@@ -116,14 +127,21 @@ class StageReplacements:
         holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
         return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
 
+    @staticmethod
+    def _in_rotations(profile: Profile) -> list[Replacement]:
+        """Return the replacement of the function that makes scaled rotations, if the script itself calls it."""
+        script, name = profile.script.module, checkout_rotations.NAME
+        replacement = Replacement(script, name, checkout_rotations.in_our_kernel, "training() in its noise")
+        return [replacement] if inspect.isfunction(vars(script).get(name)) else []
+
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
-        visibility = self._context.wrapper.visibility
-        early = original if visibility is None else visibility.in_loop(reading_late(original))
+        rows = self._context.wrapper.rows
+        ahead = original if rows is None else rows.updating(reading_late(original))
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:
-            return self._train(TrainingCall.bind(early, args, kwargs))
+            return self._train(TrainingCall.bind(ahead, args, kwargs))
 
         return training
 

@@ -48,8 +48,8 @@ class RunSettings(HierarchySettings):
     )
     run_ahead: bool = option(
         True,
-        "Let the checkout's loop go on while the GPU computes what the loop only logs, and blends an image of which it "
-        "asks for the visible Gaussians.",
+        "Let the checkout's loop go on while the GPU computes what the loop only logs, and update its statistics of "
+        "visible Gaussians without listing them.",
         panel=STORAGE,
         names=("--run-ahead/--no-run-ahead",),
     )

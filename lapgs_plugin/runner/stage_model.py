@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.ops.adam.tensorwise import fuse_steps
+from lapgs_plugin.ops.unit_quaternions import unit_quaternions
 from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runs.archive import RunArchive
@@ -20,6 +22,9 @@ from lapgs_plugin.runs.layout import OPTIMIZER
 
 SH_REST = "f_rest"
 """Parameter group of SH above degree 0 in the family's optimizers."""
+
+ROTATION = "rotation_activation"
+"""Attribute of the family's models: the function that normalises quaternions."""
 
 
 class StageModel:
@@ -57,12 +62,14 @@ class StageModel:
             setattr(gaussians, name, value)
 
     def prepare_optimizers(self, gaussians: Any, inherit: bool) -> None:
-        """Set the rate of SH in the checkout's new optimizers, fuse their steps on a GPU, and let them inherit state.
+        """Set the rate of SH in the checkout's new optimizers, and let them inherit state; fuse operations on a GPU.
 
         Args:
             gaussians: the checkout's model.
             inherit: whether the stage begins; optimizers that a loop makes later start anew in the checkout, too.
         """
+        if self._device.type == "cuda":
+            fuse_rotations(gaussians)
         optimizers = self._adapter.optimizers(gaussians)
         if self._options.sh_rate != 1.0:
             _scale_sh_rate(optimizers, self._options.sh_rate)
@@ -131,3 +138,9 @@ def _scale_sh_rate(optimizers: Sequence[torch.optim.Optimizer], factor: float) -
         )
     for group in groups:
         group["lr"] *= factor
+
+
+def fuse_rotations(gaussians: Any) -> None:
+    """Let a checkout's model normalise quaternions in our kernels, if it does in PyTorch's 17 operations."""
+    if getattr(gaussians, ROTATION, None) is normalize:
+        setattr(gaussians, ROTATION, unit_quaternions)

@@ -115,6 +115,12 @@ class StageRendering:
         candidates = [keys for matrix in rows if (keys := self._by_matrix.get(matrix))]
         return set.intersection(*candidates) if candidates else set()
 
+    @property
+    def takes_parts(self) -> bool:
+        """Whether a rasterizer may get SH in parts: nothing else reads its inputs, and gradients are recorded."""
+        precomputed = self.signed and self.path is ColorPath.PRECOMPUTED
+        return torch.is_grad_enabled() and not self.capture and not precomputed
+
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""
         images = self.images

@@ -9,11 +9,14 @@ import pytest
 import torch
 
 from lapgs_plugin.checkouts.logged_numbers import READ
+from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
-from lapgs_plugin.runner import checkout_ssim, late_numbers
-from lapgs_plugin.runner.early_visibility import PROJECTED, EarlyVisibility
+from lapgs_plugin.ops.masked_updates import update_rows
+from lapgs_plugin.runner import checkout_ssim, late_numbers, visible_rows
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_model import StageModel
+from lapgs_plugin.runner.stage_rendering import StageRendering
 from tests.contract.stub_runs import (
     FORKS,
     HALF,
@@ -77,53 +80,65 @@ def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.Monkey
 def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop logs the same numbers, and trains the same field to the bit."""
     late: list[torch.Tensor] = []
-    asked: list[torch.Tensor] = []
-    indices = EarlyVisibility.indices
 
     def read(tensor: torch.Tensor) -> Any:
         late.append(tensor)
         return late_numbers.read(tensor)
 
-    def noted(visibility: EarlyVisibility, radii: torch.Tensor) -> torch.Tensor:
-        asked.append(radii)
-        return indices(visibility, radii)
-
     monkeypatch.setitem(late_numbers.NAMES, READ, read)
-    monkeypatch.setattr(EarlyVisibility, "indices", noted)
-    found = []
+    results = []
     for on in (True, False):
         late.clear()
-        asked.clear()
         archive, result = run_hierarchy(STUBS[name], scene, tmp_path / str(on), *HALF, hierarchy=kind, run_ahead=on)
         assert len(late) == (HALF[1] if on else 0)
-        assert (len(asked) >= HALF[1]) == on
         fields = [archive.field(level) for level in (1, 0)]
-        found.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
-    assert found[0][0] == found[1][0]
-    assert all(map(torch.equal, found[0][1], found[1][1]))
+        results.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
+    assert results[0][0] == results[1][0]
+    assert all(map(torch.equal, results[0][1], results[1][1]))
 
 
 @pytest.mark.parametrize("name", [*STUBS, *FORKS])
 def test_visible_gaussians(name: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a GPU, where radii are there when a rasterizer has returned: the same field to the bit."""
-    asked: list[torch.Tensor] = []
+    """Their statistics are updated by masks, and the loop gets no indices: the same field to the bit."""
+    updated: list[bool] = []
 
-    def note(visibility: EarlyVisibility, outputs: Any) -> None:
-        for each in outputs:
-            if isinstance(each, torch.Tensor) and (each.ndim, each.dtype) == (1, torch.int32):
-                setattr(each, PROJECTED, each._version)
+    def update(mask: Any, *updates: Any) -> bool:
+        updated.append(isinstance(mask, torch.Tensor) and mask.dtype is torch.bool)
+        return updated[-1] and update_rows(mask, *updates)
 
-    def found_early(visibility: EarlyVisibility, radii: torch.Tensor) -> torch.Tensor:
-        asked.append(radii)
-        return (radii > 0).nonzero()
-
-    monkeypatch.setattr(EarlyVisibility, "note", note)
-    monkeypatch.setattr(EarlyVisibility, "_found_early", found_early)
+    monkeypatch.setattr(visible_rows, "update_rows", update)
     stub, fields = {**STUBS, **FORKS}[name], []
     for on in (True, False):
         archive, _ = run_hierarchy(stub, scene, tmp_path / str(on), *SHORT, hierarchy="laplacian", run_ahead=on)
         fields.append([archive.field(level) for level in (1, 0)])
-    assert len(asked) > 0
+    assert updated
+    assert all(updated)
+    for ours, plain in zip(*fields, strict=True):
+        assert torch.equal(ours.means, plain.means)
+        assert torch.equal(ours.sh, plain.sh)
+
+
+@pytest.mark.parametrize("name", ["dash", "mini"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_sh_in_parts(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are joined by nobody where our rasterizer renders, and the field is the same to the bit."""
+    parts: list[bool] = []
+    sh_of = RasterizerWrapper._sh
+
+    def counted(wrapper: RasterizerWrapper, model: Any) -> Any:
+        sh = sh_of(wrapper, model)
+        parts.append(isinstance(sh, ShParts))
+        return sh
+
+    monkeypatch.setattr(RasterizerWrapper, "_sh", counted)
+    fields = []
+    for apart in (True, False):
+        if not apart:
+            monkeypatch.setattr(StageRendering, "takes_parts", False)
+        archive, _ = run_hierarchy(FORKS[name], scene, tmp_path / str(apart), *SHORT, hierarchy=kind)
+        fields.append([archive.field(level) for level in (1, 0)])
+        assert any(parts) == apart
+        parts.clear()
     for ours, plain in zip(*fields, strict=True):
         assert torch.equal(ours.means, plain.means)
         assert torch.equal(ours.sh, plain.sh)

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -233,6 +234,99 @@ for grid in ("camera", "even"):
         torch.testing.assert_close(upsample_add_triton(pyramid, coarse, fine, False, sizes), found)
 """
 
+ROWS = """
+import torch
+from lapgs_plugin.ops.masked_updates import triton_works
+from lapgs_plugin.ops.masked_updates.in_torch import Update, update_rows_torch
+from lapgs_plugin.ops.masked_updates.in_triton import update_rows_triton
+
+def norm(points):  # each operation rounds once, as PyTorch's norm does on a GPU; its square root on a CPU may be off
+    squares = points[:, :1] * points[:, :1] + points[:, 1:] * points[:, 1:]
+    return squares.double().sqrt().float()
+
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 511, 1500):
+    rows, wide = torch.randn(n, 1), torch.randn(n, 4)
+    rows[::7], rows[1::7], wide[::5, 2] = torch.nan, torch.inf, torch.nan
+    mask, whole = torch.rand(n) > 0.4, torch.randint(0, 9, (n, 1)).int()
+    first, last = norm(wide[:, :2]), norm(wide[:, 2:])
+    cases = [
+        (True, rows), (False, 1), (True, 0.1), (False, whole), (False, rows, None, whole),
+        (False, wide, (None, 2)), (True, wide, (2, None), rows), (False, wide, (2, 4), whole),
+    ]
+    plain = [*cases[:5], (False, first), (True, last, None, rows), (False, last, None, whole)]
+    targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(8)]
+                         for _ in range(2))
+    update_rows_triton(mask, [Update(target, *case) for target, case in zip(targets, cases)])
+    for target, case in zip(expected, plain):
+        value = case[1] * case[3] if len(case) > 3 else case[1]
+        after = torch.maximum(target, torch.as_tensor(value)) if case[0] else target + value
+        target[mask] = after[mask]
+    for one, other in zip(targets, expected):
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+if DEVICE == "cuda":
+    assert triton_works.difference(torch.device("cuda")) == 0.0
+"""
+
+QUATERNIONS = """
+import torch
+from torch.nn.functional import normalize
+from lapgs_plugin.ops.unit_quaternions.in_triton import unit_quaternions_triton
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 255, 700):
+    values, weights = torch.randn(n, 4), torch.randn(n, 4)
+    values[::9], values[1::9] = 0.0, 1e-20
+    results = []
+    for operation, kind in ((unit_quaternions_triton, torch.float32), (normalize, torch.float64)):
+        leaf = values.to(kind).requires_grad_()
+        units = operation(leaf)
+        results.append((units.double(), torch.autograd.grad((units * weights).sum(), leaf)[0].double()))
+    for one, other in zip(*results):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    assert (results[0][0].norm(dim=1) - 1).abs()[2::9].amax() < 1e-6 if n > 2 else True
+"""
+ROTATIONS = """
+import torch
+from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
+from lapgs_plugin.ops.scaled_rotations.in_triton import scaled_rotations_triton
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 700):
+    scales, quaternions = 4 * torch.rand(n, 3), torch.randn(n, 4)
+    expected = scaled_rotations_torch(scales.double(), quaternions.double()).float()
+    torch.testing.assert_close(scaled_rotations_triton(scales, quaternions), expected, rtol=0, atol=4e-6)
+"""
+COMPILED_ROWS = """
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from lapgs_plugin.ops.masked_updates import in_triton
+from lapgs_plugin.ops.masked_updates.in_torch import Update
+
+TYPES = {torch.float32: "*fp32", torch.bool: "*i1", int: "i32"}
+
+def compiled(kernel, programs, *arguments, **constants):
+    names = kernel.arg_names
+    types = [TYPES[value.dtype if isinstance(value, torch.Tensor) else type(value)] for value in arguments]
+    signature = {**dict(zip(names, types)), **dict.fromkeys(constants, "constexpr")}
+    constexprs = {(names.index(name),): value for name, value in constants.items()}
+    source = ASTSource(kernel, {name: signature[name] for name in names}, constexprs)
+    assembly.append(triton.compile(source, GPUTarget("cuda", 90, 32), {"enable_fp_fusion": True}).asm["ptx"])
+
+assembly, in_triton.launch = [], compiled
+rows, wide = torch.ones(5, 1), torch.ones(5, 4)
+updates = [Update(rows, False, wide, (0, 2)), Update(rows, True, wide, (2, 4), rows)]
+updates.append(Update(rows, False, rows, None, rows))
+in_triton.update_rows_triton(torch.ones(5, dtype=torch.bool), updates)
+assert "mul.f32" in assembly[0] and "add.f32" in assembly[0] and "sqrt.rn.f32" in assembly[0]
+assert "fma" not in assembly[0]
+"""
+
+NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations"]
+
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
     command = [sys.executable, "-c", f"DEVICE = {device!r}\n{checks}"]
@@ -241,11 +335,18 @@ def run_checks(checks: str, device: str, **environment: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE], ids=["all", "noise", "upsample"])
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS, QUATERNIONS, ROTATIONS], ids=NAMES)
 def test_interpreted(checks: str) -> None:
     run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
 
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
+def test_products_of_rows_are_rounded_by_themselves(tmp_path: Path) -> None:
+    """Where the sum of squares is one instruction with a product, norms differ from PyTorch's in their last bit."""
+    run_checks(COMPILED_ROWS, "cpu", TRITON_INTERPRET="0", TRITON_CACHE_DIR=str(tmp_path))
+
+
 @pytest.mark.gpu
-def test_compiled() -> None:
-    run_checks(CHECKS, "cuda")
+@pytest.mark.parametrize("checks", [CHECKS, ROWS, QUATERNIONS, ROTATIONS], ids=["all", *NAMES[3:]])
+def test_compiled(checks: str) -> None:
+    run_checks(checks, "cuda")

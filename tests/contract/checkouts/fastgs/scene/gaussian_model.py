@@ -89,9 +89,9 @@ class GaussianModel(GaussianBase):
         torch.cuda.empty_cache()
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter):
-        gradient = viewspace_point_tensor.grad[update_filter]
-        self.xyz_gradient_accum[update_filter] += torch.norm(gradient[..., :2], dim=-1, keepdim=True)
-        self.xyz_gradient_accum_abs[update_filter] += torch.norm(gradient[..., 2:], dim=-1, keepdim=True)
+        points = viewspace_point_tensor
+        self.xyz_gradient_accum[update_filter] += torch.norm(points.grad[update_filter, :2], dim=-1, keepdim=True)
+        self.xyz_gradient_accum_abs[update_filter] += torch.norm(points.grad[update_filter, 2:], dim=-1, keepdim=True)
         self.denom[update_filter] += 1
 
     def final_prune_fastgs(self, min_opacity, pruning_score=None):

@@ -263,6 +263,7 @@ class GaussianBase:
             self.prune_points(prune_mask & drawn)
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter):
-        gradient = viewspace_point_tensor.grad[update_filter, :2]
-        self.xyz_gradient_accum[update_filter] += torch.norm(gradient, dim=-1, keepdim=True)
+        self.xyz_gradient_accum[update_filter] += torch.norm(
+            viewspace_point_tensor.grad[update_filter, :2], dim=-1, keepdim=True
+        )
         self.denom[update_filter] += 1

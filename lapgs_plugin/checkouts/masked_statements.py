@@ -1,0 +1,219 @@
+"""Find statements that update the rows of a mask, in functions of a checkout. Imports no torch, executes nothing.
+
+Loops of the family gather statistics of the Gaussians that a view shows:
+
+    gaussians.max_radii2D[shown] = torch.max(gaussians.max_radii2D[shown], radii[shown])
+    self.xyz_gradient_accum[shown] += torch.norm(points.grad[shown, :2], dim=-1, keepdim=True)
+    self.denom[shown] += 1
+
+Each `x[shown]` of a mask waits for the GPU, which has to say how many rows there are, and is several launches.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+from collections.abc import Collection, Mapping
+from itertools import groupby
+from typing import NamedTuple
+
+from lapgs_plugin.checkouts.rewriting import Change, call
+
+UPDATE = "_lapgs_update"
+"""Name of the function that updates the rows, and returns whether it did."""
+VISIBLE = "_lapgs_visible"
+"""Name of the function that takes the place of `(radii > 0).nonzero()`."""
+KEY = "visibility_filter"
+"""Name of the mask, or of its indices, in the results of the family's renderers."""
+LARGEST = ("max", "maximum")
+"""Functions of torch that return the larger one of two tensors' elements."""
+STATEMENTS = ("body", "orelse", "finalbody")
+"""Names of lists of statements in the nodes of a tree."""
+
+
+class _Update(NamedTuple):
+    """Describe a statement.
+
+    Attributes:
+        mask: variable of the mask.
+        arguments: of `ops.masked_updates.Update`, as expressions.
+    """
+
+    mask: str
+    arguments: tuple[ast.expr, ...]
+
+
+class MaskedUpdates(Change):
+    """Replace runs of statements that update rows of a mask, where the same can be done without listing the rows.
+
+    if not UPDATE(shown, (self.sums, False, points.grad, (None, 2), None), (self.denom, False, 1, None, None)):
+        self.sums[shown] += torch.norm(points.grad[shown, :2], dim=-1, keepdim=True)
+        self.denom[shown] += 1
+    """
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        """Return the node with updates in the places of its statements."""
+        super().generic_visit(node)
+        for name in STATEMENTS:
+            statements = getattr(node, name, None)
+            if isinstance(statements, list):
+                runs = groupby(statements, lambda statement: update.mask if (update := _update(statement)) else None)
+                replaced = [self._replaced(mask, list(run)) for mask, run in runs]
+                setattr(node, name, [statement for run in replaced for statement in run])
+        return node
+
+    def _replaced(self, mask: str | None, statements: list[ast.stmt]) -> list[ast.stmt]:
+        if mask is None:
+            return statements
+        self.changes += len(statements)
+        updates = [update for statement in statements if (update := _update(statement))]
+        arguments = [ast.Tuple(copy.deepcopy(list(update.arguments)), ast.Load()) for update in updates]
+        done = call(UPDATE, ast.Name(mask, ast.Load()), *arguments)
+        return [ast.copy_location(ast.If(ast.UnaryOp(ast.Not(), done), statements, []), statements[0])]
+
+
+class VisibleIndices(Change):
+    """Replace `(radii > 0).nonzero()`."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        """Return the node or its replacement."""
+        self.generic_visit(node)
+        match node:
+            case ast.Call(
+                ast.Attribute(ast.Compare(ast.Name() as radii, [ast.Gt()], [ast.Constant(0)]), "nonzero"), [], []
+            ):
+                self.changes += 1
+                return ast.copy_location(call(VISIBLE, radii), node)
+        return node
+
+
+def _update(statement: ast.stmt) -> _Update | None:
+    match statement:
+        case ast.Assign(
+            targets=[ast.Subscript(target, ast.Name(mask)) as rows],
+            value=ast.Call(ast.Attribute(ast.Name("torch"), function), [one, other], []),
+        ) if function in LARGEST:
+            value = next((new for old, new in ((one, other), (other, one)) if _is_same(rows, old)), None)
+            takes_largest = True
+        case ast.AugAssign(target=ast.Subscript(target, ast.Name(mask)), op=ast.Add(), value=value):
+            takes_largest = False
+        case _:
+            return None
+    source = _source(value, mask)
+    if source is None or not _is_plain(target, mask):
+        return None
+    return _Update(mask, (target, ast.Constant(takes_largest), *source))
+
+
+def _is_same(stored: ast.Subscript, loaded: ast.expr) -> bool:
+    return ast.unparse(stored) == ast.unparse(loaded)
+
+
+def _source(value: ast.expr | None, mask: str) -> tuple[ast.expr, ast.expr, ast.expr] | None:
+    """Return the source, columns and factor of an update by a value; None for other values."""
+    nothing = ast.Constant(None)
+    match value:
+        case ast.Constant(int() | float()):
+            return value, nothing, nothing
+        case ast.BinOp(norm, ast.Mult(), ast.Subscript(factor, ast.Name(index))) if index == mask:
+            source = _rows(norm, mask)
+            return (*source, factor) if source is not None and _is_plain(factor, mask) else None
+    source = _rows(value, mask)
+    return None if source is None else (*source, nothing)
+
+
+def _rows(value: ast.expr | None, mask: str) -> tuple[ast.expr, ast.expr] | None:
+    """Return the source and columns of `source[mask]` or `torch.norm(source[mask, a:b], dim=-1, keepdim=True)`."""
+    match value:
+        case ast.Subscript(source, ast.Name(index)) if index == mask and _is_plain(source, mask):
+            return source, ast.Constant(None)
+        case ast.Call(
+            ast.Attribute(ast.Name("torch"), "norm"),
+            [ast.Subscript(source, ast.Tuple([ast.Name(index), ast.Slice(first, last, None)]))],
+            keywords,
+        ) if index == mask and _is_plain(source, mask):
+            options = sorted((str(option.arg), ast.unparse(option.value)) for option in keywords)
+            bounds = [ast.Constant(None) if bound is None else bound for bound in (first, last)]
+            if options == [("dim", "-1"), ("keepdim", "True")] and all(isinstance(b, ast.Constant) for b in bounds):
+                return source, ast.Tuple(bounds, ast.Load())
+    return None
+
+
+def _is_plain(expression: ast.expr, mask: str) -> bool:
+    """Return whether an expression is another variable than the mask, or an attribute of one."""
+    while isinstance(expression, ast.Attribute):
+        expression = expression.value
+    return isinstance(expression, ast.Name) and expression.id != mask
+
+
+def only_updates_by(function: ast.FunctionDef, mask: str, methods: Mapping[str, ast.FunctionDef] | None = None) -> bool:
+    """Return whether a function uses a variable for nothing but updates of its rows.
+
+    Args:
+        function: a tree, not changed yet.
+        mask: the variable.
+        methods: of the model, that the function may give the variable to, by name.
+    """
+    nodes = list(ast.walk(function))
+    uses = {node for node in nodes if isinstance(node, ast.Name) and node.id == mask and isinstance(node.ctx, ast.Load)}
+    for node in nodes:
+        if isinstance(node, ast.stmt) and (update := _update(node)) is not None and update.mask == mask:
+            uses -= set(ast.walk(node))
+        elif isinstance(node, ast.Call):
+            uses -= {argument for argument in node.args if _is_only_updated_by(node, argument, methods or {})}
+    return not uses
+
+
+def _is_only_updated_by(node: ast.Call, argument: ast.expr, methods: Mapping[str, ast.FunctionDef]) -> bool:
+    """Return whether a method that is called with an argument uses it for nothing but updates of its rows."""
+    method = methods.get(node.func.attr) if isinstance(node.func, ast.Attribute) else None
+    position = node.args.index(argument) + 1  # after self
+    if method is None or position >= len(method.args.args) or any(isinstance(a, ast.Starred) for a in node.args):
+        return False
+    return only_updates_by(method, method.args.args[position].arg)
+
+
+def keeps_masks(training: ast.FunctionDef, renderers: Collection[str], methods: Mapping[str, ast.FunctionDef]) -> bool:
+    """Return whether a training function uses the indices of its renders for nothing but updates of their rows.
+
+    Args:
+        training: its tree, not changed yet.
+        renderers: names of the functions that return the indices, as `KEY` of their results.
+        methods: of the model, by name.
+    """
+    nodes = list(ast.walk(training))
+    parents = {child: node for node in nodes for child in ast.iter_child_nodes(node)}
+    results = set()
+    for node in nodes:
+        if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", None)) in renderers:
+            match parents[node]:
+                case ast.Assign(targets=[ast.Name(name)]):
+                    results.add(name)
+                case ast.Subscript(slice=ast.Constant(str(key))) if key != KEY:
+                    pass
+                case _:
+                    return False
+    masks = set()
+    for node in nodes:
+        if isinstance(node, ast.Name) and node.id in results and isinstance(node.ctx, ast.Load):
+            match parents[node]:
+                case ast.Subscript(value, ast.Constant(str(key)), ast.Load()) as item if value is node:
+                    if key == KEY:
+                        masks.add(_variable(item, parents))
+                case _:
+                    return False
+    return bool(masks) and all(mask is not None and only_updates_by(training, mask, methods) for mask in masks)
+
+
+def _variable(value: ast.expr, parents: Mapping[ast.AST, ast.AST]) -> str | None:
+    """Return the variable that a value is assigned to, by itself or among others."""
+    parent = parents[value]
+    match parent:
+        case ast.Assign(targets=[ast.Name(name)]):
+            return name
+        case ast.Tuple(values):
+            match parents[parent]:
+                case ast.Assign(targets=[ast.Tuple(targets)]) if len(targets) == len(values):
+                    target = targets[values.index(value)]
+                    return target.id if isinstance(target, ast.Name) else None
+    return None

@@ -1,0 +1,267 @@
+"""Rows of visible Gaussians updated by their mask, against the statements as they are."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch import Tensor
+
+from lapgs_plugin.checkouts.masked_statements import keeps_masks
+from lapgs_plugin.ops.masked_updates import update_rows
+from lapgs_plugin.ops.masked_updates.in_torch import Update
+from lapgs_plugin.runner import visible_rows
+from lapgs_plugin.runner.visible_rows import VisibleRows
+from tests.devices import DEVICES
+
+MODEL = """
+import torch
+
+class Model:
+    def __init__(self, count, device="cpu"):
+        self.largest, self.weight = torch.zeros(count, device=device), torch.zeros(count, 1, device=device)
+        self.sums, self.sums_abs, self.peak, self.views = (torch.zeros(count, 1, device=device) for _ in range(4))
+    def add_densification_stats(self, points, update_filter, pixels):
+        self.sums[update_filter] += torch.norm(points.grad[update_filter, :2], dim=-1, keepdim=True)
+        self.sums_abs[update_filter] += torch.norm(points.grad[update_filter, 2:],
+                                                   dim=-1, keepdim=True) * pixels[update_filter]
+        self.peak[update_filter] = torch.max(self.peak[update_filter],
+                                             torch.norm(points.grad[update_filter, 2:], dim=-1, keepdim=True))
+        self.views[update_filter] += 1
+
+def render(values):
+    radii = values.int()
+    return {"radii": radii, "visibility_filter": (radii > 0).nonzero(), "image": values}
+
+def training(model, views, render):
+    with torch.no_grad():
+        for values, points, weight in views:
+            package = render(values)
+            shown, radii = package["visibility_filter"], package["radii"]
+            model.weight[shown] = torch.maximum(weight[shown], model.weight[shown])
+            if len(radii) > 0:
+                # Largest radii
+                model.largest[shown] = torch.max(model.largest[shown], radii[shown])
+                model.add_densification_stats(points, shown, weight)
+"""
+
+FLOATS = st.one_of(st.floats(-1e3, 1e3, width=32), st.sampled_from([math.nan, math.inf]))
+
+
+class _Counted:
+    """Count the updates that were done by a mask."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done: list[bool] = []
+        monkeypatch.setattr(visible_rows, "update_rows", self._update)
+
+    def _update(self, *arguments: Any) -> bool:
+        self.done.append(update_rows(*arguments))
+        return self.done[-1]
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> _Counted:
+    return _Counted(monkeypatch)
+
+
+def _changed(module: ModuleType) -> SimpleNamespace:
+    """Return the functions of a module as `lapgs run` changes them."""
+    rows = VisibleRows()
+    rows.note_loop(module.training, {"render"}, {"add_densification_stats": module.Model.add_densification_stats})
+    loop = rows.updating(module.training)
+    model = type("Model", (module.Model,), {})
+    model.add_densification_stats = rows.updating(module.Model.add_densification_stats)  # type: ignore[attr-defined]
+    by_loop = rows.is_for_masks(loop.__code__)
+    return SimpleNamespace(training=loop, Model=model, render=rows.in_renderer(module.render, lambda: by_loop))
+
+
+def _views(count: int, device: str) -> list[Any]:
+    generator = torch.Generator().manual_seed(count)
+
+    def normal(columns: tuple[int, ...]) -> Tensor:
+        return torch.randn(count, *columns, generator=generator).to(device)
+
+    points = [SimpleNamespace(grad=normal((4,))) for _ in range(3)]
+    return [(3 * normal(()), each, normal((1,))) for each in points]
+
+
+def _state(model: Any) -> list[np.ndarray[Any, Any]]:
+    return [value.cpu().numpy().view(np.int32) for value in vars(model).values()]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 2, 7, 1000])
+def test_a_loop_gathers_the_same(
+    load_module: Callable[[str], ModuleType], counted: _Counted, device: str, count: int
+) -> None:
+    """To the bit, and its renderer returns masks, so that nothing is listed."""
+    module, views = load_module(MODEL), _views(count, device)
+    changed = _changed(module)
+    assert changed.render(views[0][0])["visibility_filter"].dtype is torch.bool
+    states = []
+    for functions in (module, changed):
+        model = functions.Model(count, device)
+        functions.training(model, views, functions.render)
+        states.append(_state(model))
+    assert all(map(np.array_equal, *states))
+    assert counted.done == 9 * [True]  # weights, radii, statistics; three views
+
+
+@settings(deadline=None)
+@given(
+    st.integers(1, 40).flatmap(
+        lambda n: st.tuples(
+            arrays(np.float32, (n, 5), elements=FLOATS),
+            arrays(bool, n),
+            arrays(np.int32, n, elements=st.integers(0, 99)),
+        )
+    )
+)
+def test_values_of_any_kind(drawn: tuple[Any, Any, Any]) -> None:
+    values, mask, radii = map(torch.from_numpy, drawn)
+    before, points = values[:, 4].contiguous(), values[:, :4].contiguous()
+    for as_column in (False, True):
+
+        def rows(value: Tensor, as_column: bool = as_column) -> Tensor:
+            return value.reshape(-1, 1).clone() if as_column else value.clone()
+
+        cases: list[tuple[bool, Any]] = [(True, rows(radii)), (False, rows(radii)), (False, 3), (False, 0.1)]
+        cases += [(False, rows(points[:, 0])), (True, rows(points[:, 1] + 0.0))]
+        for takes_largest, source in cases:
+            ours, plain = rows(before), rows(before)
+            assert update_rows(mask, [Update(ours, takes_largest, source)])
+            value = source if isinstance(source, (int, float)) else source[mask]
+            plain[mask] = torch.max(plain[mask], value) if takes_largest else plain[mask] + value
+            torch.testing.assert_close(ours, plain, rtol=0, atol=0, equal_nan=True)
+    ours, plain = (before.reshape(-1, 1).clone() for _ in range(2))
+    assert update_rows(mask, [Update(ours, False, points, (None, 2))])
+    plain[mask] += torch.norm(points[mask, :2], dim=-1, keepdim=True)
+    torch.testing.assert_close(ours, plain, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("kind", ["indices", "column", "uint8", "float64", "strided"])
+def test_what_does_not_fit_is_done_as_written(
+    load_module: Callable[[str], ModuleType], counted: _Counted, kind: str
+) -> None:
+    module, count = load_module(MODEL), 50
+    points, mask = SimpleNamespace(grad=torch.randn(count, 4)), torch.randn(count) > 0
+    pixels = torch.rand(count, 1)
+    if kind == "strided":
+        points.grad = torch.randn(4, count).T
+    others = {"indices": mask.nonzero()[:, 0], "column": mask.nonzero(), "uint8": mask}
+    states = []
+    for functions in (module, _changed(module)):
+        model = functions.Model(count)
+        if kind == "float64":
+            model.views = model.views.double()
+        functions.Model.add_densification_stats(model, points, others.get(kind, mask), pixels)
+        states.append([value.numpy() for value in vars(model).values()])
+    assert all(map(np.array_equal, *states))
+    assert counted.done == [kind == "uint8"]
+
+
+def test_updates_that_depend_on_each_other_or_have_gradients() -> None:
+    mask, rows = torch.tensor([True, False]), torch.ones(2)
+    points = torch.ones(2, 4)
+    for updates in (
+        [Update(rows, False, rows)],
+        [Update(rows, False, 1), Update(torch.zeros(2), True, rows)],
+        [Update(rows, False, 1), Update(rows, True, 5)],
+        [Update(points[0, :2], False, points[1, :2])],
+        [Update(rows, False, 1), Update(torch.zeros(2), False, torch.ones(3))],
+        [Update(rows, False, torch.ones(2, requires_grad=True))],
+        [Update(rows[:, None], False, points, (0, 3))],
+        [Update(rows, False, points, (0, 2))],
+        [Update(rows, False, True)],
+        [Update(rows, False, None)],
+    ):
+        assert not update_rows(mask, updates)
+    assert rows.tolist() == [1, 1]
+    with torch.no_grad():
+        assert update_rows(mask, [Update(rows, False, torch.ones(2, requires_grad=True))])
+    assert rows.tolist() == [2, 1]
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "model.sums[shown] += torch.norm(points[shown, :2], dim=-1)",
+        "model.sums[shown] += torch.norm(points[other, :2], dim=-1, keepdim=True)",
+        "model.sums[shown] += torch.norm(points[shown, :n], dim=-1, keepdim=True)",
+        "model.sums[shown] -= 1",
+        "model.sums[shown] = torch.max(model.views[shown], radii[shown])",
+        "model.sums[shown] = torch.max(model.sums[shown], radii)",
+        "model.sums[shown] = torch.max(model.sums[shown], radii[other])",
+        "model.sums()[shown] += 1",
+        "model.sums[shown, 0] += 1",
+        "model.sums[shown] += n",
+        "shown[shown] += 1",
+    ],
+)
+def test_other_statements_are_left(load_module: Callable[[str], ModuleType], statement: str) -> None:
+    module = load_module(f"import torch\ndef f(model, points, radii, shown, other, n):\n    {statement}\n")
+    assert VisibleRows().updating(module.f) is module.f
+
+
+def test_functions_that_are_left(load_module: Callable[[str], ModuleType]) -> None:
+    body = "class Model:\n    def f(self, shown):\n        {}[shown] += 1\n"
+    rows = VisibleRows()
+    assert rows.updating(len) is len
+    private = load_module("import torch\n" + body.format("self.__sums")).Model.f
+    assert rows.updating(private) is private
+    without_torch = load_module(body.format("self.sums")).Model.f
+    assert rows.updating(without_torch) is without_torch
+    other_torch = load_module("torch = None\n" + body.format("self.sums")).Model.f
+    assert rows.updating(other_torch) is other_torch
+
+
+def test_errors_name_the_line_as_written(load_module: Callable[[str], ModuleType]) -> None:
+    module = load_module(MODEL)
+    model = _changed(module).Model(3)
+    with pytest.raises(TypeError, match="NoneType") as caught:
+        model.add_densification_stats(SimpleNamespace(grad=None), torch.ones(3, dtype=torch.bool), None)
+    lines = MODEL.split("\n")
+    assert lines[caught.traceback[-1].lineno].strip().startswith("self.sums[update_filter] +=")
+
+
+STATISTICS = "def add_densification_stats(self, points, update_filter):\n    self.views[update_filter] += 1\n"
+PACKAGE = 'package = render(view)\nimage, shown = package["image"], package["visibility_filter"]\n'
+
+
+@pytest.mark.parametrize(
+    ("lines", "statistics", "expected"),
+    [
+        ("a.b[shown] += 1\n", STATISTICS, True),
+        ("model.add_densification_stats(points, shown)\n", STATISTICS, True),
+        ("model.add_densification_stats(points, shown)\n", STATISTICS + "    print(update_filter)\n", False),
+        ("model.add_densification_stats(shown, points)\n", STATISTICS, True),  # that parameter is not used
+        ("model.add_densification_stats(points, update_filter=shown)\n", STATISTICS, False),
+        ("model.add_densification_stats(*points, shown)\n", STATISTICS, False),
+        ("model.other(points, shown)\n", STATISTICS, False),
+        ("a.b[shown] += 1\nprint(shown.sum())\n", STATISTICS, False),
+        ("a.b[shown] = 1\n", STATISTICS, False),
+        ("kept.append(package)\n", STATISTICS, False),
+        ("report(package['visibility_filter'])\n", STATISTICS, False),
+        ("for name in names: print(package[name])\n", STATISTICS, False),
+        ("show(render(view)['image'])\n", STATISTICS, True),
+        ("show(render(view))\n", STATISTICS, False),
+        ("show(render(view)['visibility_filter'])\n", STATISTICS, False),
+        ("module.render(view).values()\n", STATISTICS, False),
+    ],
+)
+def test_where_masks_take_the_places_of_indices(lines: str, statistics: str, expected: bool) -> None:
+    body = "".join(f"    {line}\n" for line in (PACKAGE + lines).splitlines())
+    training, method = (ast.parse(text).body[0] for text in (f"def training(view, model):\n{body}", statistics))
+    assert isinstance(training, ast.FunctionDef)
+    assert isinstance(method, ast.FunctionDef)
+    assert keeps_masks(training, {"render"}, {method.name: method}) == expected
