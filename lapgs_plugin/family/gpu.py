@@ -86,12 +86,9 @@ class _Call:
         degree = int(settings.sh_degree)
         self.degree, self.signed, self.columns = degree & ~SIGNED_COLOR_BIT, degree < 0, inputs.means2d.shape[1]
         like = inputs.means
-        view, full, centre, background = (
-            tensor.detach().to(like)
-            for tensor in (settings.viewmatrix, settings.projmatrix, settings.campos, settings.bg)
-        )
-        self.background = background.contiguous()
-        self._matrices = view, full, centre
+        self.background = _beside(settings.bg, like).contiguous()
+        view, full, centre = settings.viewmatrix, settings.projmatrix, settings.campos
+        self._matrices = _beside(view, like), _beside(full, like), _beside(centre, like)
         self._tangents = settings.tanfovx, settings.tanfovy
 
     @cached_property
@@ -102,16 +99,22 @@ class _Call:
         return camera_of(*self._matrices, self._tangents, self.size)
 
 
+def _beside(tensor: Tensor, like: Tensor) -> Tensor:
+    """Return a tensor without gradients, of the type and on the device of another."""
+    tensor = tensor.detach()
+    return tensor if tensor.dtype == like.dtype and tensor.device == like.device else tensor.to(like)
+
+
 def _parameters(inputs: Inputs) -> tuple[Parameters, Tensor | None]:
-    """Return tensors as the kernels take them, and the first coefficients that are apart."""
+    """Return tensors as the kernels take them, and the first coefficients that are apart; no gradients pass."""
     scales = inputs.covariances if inputs.scales is None else inputs.scales
     colors = inputs.colors if inputs.sh is None else inputs.sh
     assert scales is not None
     assert colors is not None
-    means = aligned(inputs.means.detach())
-    quats = means if inputs.quats is None else aligned(inputs.quats.detach())  # any tensor that is not read
-    parts = means, quats, aligned(scales.detach()), aligned(inputs.opacities.detach()), aligned(colors.detach())
-    return Parameters(*parts), None if inputs.dc is None else aligned(inputs.dc.detach())
+    means = aligned(inputs.means)
+    quats = means if inputs.quats is None else aligned(inputs.quats)  # any tensor that is not read
+    parts = means, quats, aligned(scales), aligned(inputs.opacities), aligned(colors)
+    return Parameters(*parts), None if inputs.dc is None else aligned(inputs.dc)
 
 
 class _Rasterize(torch.autograd.Function):

@@ -135,23 +135,36 @@ def _rounded(pairs: float) -> int:
     return min(max(-(-int(pairs) // step), 1) * step, MOST_PAIRS)
 
 
+_Slot = tuple[Tensor, torch.cuda.Event]
+_free_slots: dict[torch.device, list[_Slot]] = {}  # each takes the processor longer to make than to use
+
+
 class _LateNumber:
     """Copy a number from a device to page-locked memory, to be read when the device has arrived there."""
 
     def __init__(self, number: Tensor) -> None:
         self._value: int | None = None
-        self._copied: torch.cuda.Event | None = None
+        self._number, self._slot = number, None
         if number.is_cuda:
-            self._copy = torch.empty_like(number, device="cpu", pin_memory=True).copy_(number, non_blocking=True)
-            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
-            self._copied.record(torch.cuda.current_stream(number.device))
-        else:
-            self._copy = number
+            free = _free_slots.setdefault(number.device, [])
+            self._slot = free.pop() if free else _new_slot(number)
+            copy, copied = self._slot
+            copy.copy_(number, non_blocking=True)
+            copied.record(torch.cuda.current_stream(number.device))
 
     def read(self) -> int:
         """Return the number; the first time, wait for it."""
         if self._value is None:
-            if self._copied is not None:
-                self._copied.synchronize()
-            self._value = int(self._copy)
+            if self._slot is None:
+                self._value = int(self._number)
+            else:
+                copy, copied = self._slot
+                copied.synchronize()
+                self._value = int(copy)
+                _free_slots[self._number.device].append(self._slot)
         return self._value
+
+
+def _new_slot(number: Tensor) -> _Slot:
+    """Return page-locked memory for a number, and an event."""
+    return torch.empty_like(number, device="cpu", pin_memory=True), torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
