@@ -16,6 +16,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.call import SUMS, Blending, Contributions, Inputs, Options, Output, Settings
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.records import RECORD, TILE, Blended, Parameters, aligned
+from lapgs_plugin.gpu_raster.replay import take_frame
 from lapgs_plugin.gpu_raster.rules import Numbers, Rules
 from lapgs_plugin.gpu_raster.tiles import blend_family_in_tiles
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
@@ -136,9 +137,11 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(radii, centres, depths)
             return image, image[:1].clone(), radii, centres, depths
         parameters, first = _parameters(inputs)
-        seen = project(parameters, call.camera, call.degree, call.signed, True, call.rules, call.numbers, first)
+        rules, mult = call.rules, call.numbers.mult
+        frame, into = take_frame(parameters.means, len(parameters.means), call.size, rules, mult) or (None, None)
+        seen = project(parameters, call.camera, call.degree, call.signed, True, rules, call.numbers, first, into)
         tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
-            seen, call.background, call.size, call.rules, call.numbers.mult
+            seen, call.background, call.size, rules, mult, frame
         )
         ctx.save_for_backward(
             *parameters, first, *tiles, seen.radii, seen.records, image, inverse_depths, counts, words
@@ -146,10 +149,11 @@ class _Rasterize(torch.autograd.Function):
         if call.keeps:
             call.blended = Blended(seen.records, *tiles, image, counts, words)
         radii, centres, depths = seen.visible_radii[0], seen.centres[0], seen.depths[0]
+        if frame is not None:  # the next view is written there
+            depths = depths.clone()
         ctx.mark_non_differentiable(radii, centres, depths)
         # Copies, which checkouts may change in place as they may those of the CUDA code.
-        by_depth = inverse_depths.clone() if call.rules.depth else inverse_depths
-        return image[0].clone(), by_depth, radii, centres, depths
+        return image[0].clone(), inverse_depths.clone(), radii, centres, depths
 
     @staticmethod
     @once_differentiable

@@ -622,6 +622,7 @@ def camera_of(
 def project(
     parameters: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
     rules: Rules = GSPLAT, numbers: Numbers = NUMBERS, first: Tensor | None = None,
+    into: Sequence[Tensor] | None = None,
 ) -> Projected:  # fmt: skip
     """Project at least one Gaussian, and evaluate its colour.
 
@@ -631,13 +632,19 @@ def project(
         with_geometry: fill in visible radii and centres.
         rules, numbers: those of `parameters`, too.
         first: (n, 1, 3) first coefficients, if they are apart.
+        into: radii, centres, depths and records to write to, as in `Projected`; None for new ones.
     """
     count, n, like = len(cameras.poses), len(parameters.means), parameters.means
-    integers = like.new_empty(count, n, 2, dtype=torch.int32)
+    if into is None:
+        into = (
+            like.new_empty(count, n, 2, dtype=torch.int32), like.new_empty(count, 0 if rules.family else n, 2),
+            like.new_empty(count, n), like.new_empty(count, n, RECORD),
+        )  # fmt: skip
+    radii, means2d, depths, records = into
     described = n if with_geometry else 0
     projected = Projected(
-        integers, like.new_empty(count, 0 if rules.family else n, 2), like.new_empty(count, n),
-        like.new_empty(count, n, RECORD), integers.new_empty(count, described), like.new_empty(count, described, 2),
+        radii, means2d, depths, records,
+        like.new_empty(count, described, dtype=torch.int32), like.new_empty(count, described, 2),
     )  # fmt: skip
     _project(parameters, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
     return projected

@@ -12,6 +12,7 @@ Where gsplat's CUDA part is built already, its sorting is used, which takes the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
 from lapgs_plugin.gpu_raster.records import Projected, grid_of
+from lapgs_plugin.gpu_raster.replay import Frame
 from lapgs_plugin.gpu_raster.rules import Rules
 
 T = TypeVar("T")
@@ -77,12 +79,18 @@ def blend_in_tiles(
 
 
 def blend_family_in_tiles(
-    projected: Projected, background: Tensor, size: tuple[int, int], rules: Rules, mult: float
+    projected: Projected,
+    background: Tensor,
+    size: tuple[int, int],
+    rules: Rules,
+    mult: float,
+    frame: Frame | None = None,
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Sort Gaussians of one camera into tiles, front to back, and blend them by the family's rules.
 
     Args:
         background, size, rules, mult: as `blend_family` takes them.
+        frame: that they were projected to.
 
     Returns:
         Offsets and Gaussians of pairs as `blend_family` takes them, and its results.
@@ -94,6 +102,9 @@ def blend_family_in_tiles(
     from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     radii, means2d, depths, records = projected[:4]
+    key = records.device, *size, rules
+    if frame is not None:
+        return _with_room(key, frame.sort(), partial(frame.blend, background))
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid, True)
 
@@ -101,7 +112,7 @@ def blend_family_in_tiles(
         tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, room, True)
         return tiles, blend_family(records, background, *tiles, size, rules, mult)
 
-    return _with_room((records.device, *size, rules), ends[-1], attempt)
+    return _with_room(key, ends[-1], attempt)
 
 
 def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
