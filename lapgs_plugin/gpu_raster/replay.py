@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lapgs_plugin.gpu_raster.records import RECORD, grid_of
 from lapgs_plugin.gpu_raster.rules import Rules
+from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS
 
 T = TypeVar("T")
 Destination = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -102,7 +103,7 @@ def take_frame(
         None if the view has to be launched without a frame.
     """
     device = like.device
-    if not ENABLED or n < LEAST_GAUSSIANS or device.type != "cuda" or _broken:
+    if not ENABLED or n < LEAST_GAUSSIANS or device.type != "cuda" or torch.version.hip is not None or _broken:
         return None
     if device.index != torch.cuda.current_device() or torch.cuda.is_current_stream_capturing():
         return None
@@ -164,7 +165,7 @@ class Frame:
         """Sort pairs by tile and blend them; there is room for as many pairs or more."""
         self._background.copy_(background)
         if self._blending is None or not pairs <= self._pairs <= MOST_ROOM * pairs:
-            self._blending, self._pairs = None, int(HEADROOM * pairs)  # its memory is needed
+            self._blending, self._pairs = None, min(int(HEADROOM * pairs), MOST_PAIRS)  # its memory is needed
             self._blending = self._recorder.record(self._sort_and_blend)
         return self._blending.replay()
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,8 +21,10 @@ from torch import Tensor
 from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
 from lapgs_plugin.gpu_raster.records import Projected, grid_of
-from lapgs_plugin.gpu_raster.replay import Frame
 from lapgs_plugin.gpu_raster.rules import Rules
+
+if TYPE_CHECKING:
+    from lapgs_plugin.gpu_raster.replay import Frame
 
 T = TypeVar("T")
 
