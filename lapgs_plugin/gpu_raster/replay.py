@@ -107,6 +107,8 @@ def take_frame(
         return None
     if device.index != torch.cuda.current_device() or torch.cuda.is_current_stream_capturing():
         return None
+    if torch.is_inference_mode_enabled():  # memory that was reserved then could not be saved for a backward pass
+        return None
     kind = device, torch.cuda.current_stream(device).cuda_stream, size, rules, mult
     with _lock:
         frame = _frames.get(kind, n, like)

@@ -180,4 +180,5 @@ class _LateNumber:
 
 def _new_slot(number: Tensor) -> _Slot:
     """Return page-locked memory for a number, and an event."""
-    return torch.empty_like(number, device="cpu", pin_memory=True), torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
+    with torch.inference_mode(False):  # it is written to in other modes, too
+        return torch.empty_like(number, device="cpu", pin_memory=True), torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
