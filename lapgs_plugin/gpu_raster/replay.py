@@ -75,6 +75,8 @@ class _Frames:
 
     def _make_place(self, kind: _Kind) -> bool:
         """Drop the frame of a kind or, if there are too many, one that is idle; return False if none is."""
+        if torch.cuda.get_allocator_backend() != "native":  # others may move a graph's memory
+            return False
         if kind not in self._by_kind:
             if len(self._by_kind) < MOST_FRAMES:
                 return True
