@@ -16,6 +16,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.call import SUMS, Blending, Contributions, Inputs, Options, Output, Settings
 from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.records import RECORD, TILE, Blended, Parameters, aligned
+from lapgs_plugin.gpu_raster.replay import take_frame
 from lapgs_plugin.gpu_raster.rules import Numbers, Rules
 from lapgs_plugin.gpu_raster.tiles import blend_family_in_tiles
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
@@ -86,12 +87,9 @@ class _Call:
         degree = int(settings.sh_degree)
         self.degree, self.signed, self.columns = degree & ~SIGNED_COLOR_BIT, degree < 0, inputs.means2d.shape[1]
         like = inputs.means
-        view, full, centre, background = (
-            tensor.detach().to(like)
-            for tensor in (settings.viewmatrix, settings.projmatrix, settings.campos, settings.bg)
-        )
-        self.background = background.contiguous()
-        self._matrices = view, full, centre
+        self.background = _beside(settings.bg, like).contiguous()
+        view, full, centre = settings.viewmatrix, settings.projmatrix, settings.campos
+        self._matrices = _beside(view, like), _beside(full, like), _beside(centre, like)
         self._tangents = settings.tanfovx, settings.tanfovy
 
     @cached_property
@@ -102,16 +100,22 @@ class _Call:
         return camera_of(*self._matrices, self._tangents, self.size)
 
 
+def _beside(tensor: Tensor, like: Tensor) -> Tensor:
+    """Return a tensor without gradients, of the type and on the device of another."""
+    tensor = tensor.detach()
+    return tensor if tensor.dtype == like.dtype and tensor.device == like.device else tensor.to(like)
+
+
 def _parameters(inputs: Inputs) -> tuple[Parameters, Tensor | None]:
-    """Return tensors as the kernels take them, and the first coefficients that are apart."""
+    """Return tensors as the kernels take them, and the first coefficients that are apart; no gradients pass."""
     scales = inputs.covariances if inputs.scales is None else inputs.scales
     colors = inputs.colors if inputs.sh is None else inputs.sh
     assert scales is not None
     assert colors is not None
-    means = aligned(inputs.means.detach())
-    quats = means if inputs.quats is None else aligned(inputs.quats.detach())  # any tensor that is not read
-    parts = means, quats, aligned(scales.detach()), aligned(inputs.opacities.detach()), aligned(colors.detach())
-    return Parameters(*parts), None if inputs.dc is None else aligned(inputs.dc.detach())
+    means = aligned(inputs.means)
+    quats = means if inputs.quats is None else aligned(inputs.quats)  # any tensor that is not read
+    parts = means, quats, aligned(scales), aligned(inputs.opacities), aligned(colors)
+    return Parameters(*parts), None if inputs.dc is None else aligned(inputs.dc)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -133,9 +137,11 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(radii, centres, depths)
             return image, image[:1].clone(), radii, centres, depths
         parameters, first = _parameters(inputs)
-        seen = project(parameters, call.camera, call.degree, call.signed, True, call.rules, call.numbers, first)
+        rules, mult = call.rules, call.numbers.mult
+        frame, into = take_frame(parameters.means, len(parameters.means), call.size, rules, mult) or (None, None)
+        seen = project(parameters, call.camera, call.degree, call.signed, True, rules, call.numbers, first, into)
         tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
-            seen, call.background, call.size, call.rules, call.numbers.mult
+            seen, call.background, call.size, rules, mult, frame
         )
         ctx.save_for_backward(
             *parameters, first, *tiles, seen.radii, seen.records, image, inverse_depths, counts, words
@@ -143,10 +149,11 @@ class _Rasterize(torch.autograd.Function):
         if call.keeps:
             call.blended = Blended(seen.records, *tiles, image, counts, words)
         radii, centres, depths = seen.visible_radii[0], seen.centres[0], seen.depths[0]
+        if frame is not None:  # the next view is written there
+            depths = depths.clone()
         ctx.mark_non_differentiable(radii, centres, depths)
         # Copies, which checkouts may change in place as they may those of the CUDA code.
-        by_depth = inverse_depths.clone() if call.rules.depth else inverse_depths
-        return image[0].clone(), by_depth, radii, centres, depths
+        return image[0].clone(), inverse_depths.clone(), radii, centres, depths
 
     @staticmethod
     @once_differentiable

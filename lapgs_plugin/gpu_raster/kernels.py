@@ -580,13 +580,15 @@ def _store_screen_gradients(
         tl.store(into + 2, 0.0 * of_x, here)
 
 
-@triton.jit(do_not_specialize=("width", "height", "down_1", "right_1", "down_2", "right_2"))
+@triton.jit(do_not_specialize=("width", "height", "down_1", "right_1", "down_2", "right_2", "down_3"))
 def _camera_kernel(
-    view: tl.tensor, full: tl.tensor, pose: tl.tensor, intrinsics: tl.tensor,
-    width: int, height: int, down_1: int, right_1: int, down_2: int, right_2: int, tan_x: float, tan_y: float,
+    view: tl.tensor, full: tl.tensor, centre: tl.tensor, pose: tl.tensor, intrinsics: tl.tensor, position: tl.tensor,
+    width: int, height: int, down_1: int, right_1: int, down_2: int, right_2: int, down_3: int,
+    tan_x: float, tan_y: float,
 ) -> None:  # fmt: skip
     """Write a camera as other kernels read it from transposed matrices, of any strides, as the CUDA code takes them."""
     number = tl.arange(0, 16)
+    tl.store(position + number, tl.load(centre + number * down_3, number < 3, 0.0), number < 3)
     tl.store(pose + number, tl.load(view + number % 4 * down_1 + number // 4 * right_1))
     # The axis of the camera in the world, by the rotation's inverse: R (r0 x r1) is along it.
     a, b, c = tl.load(view), tl.load(view + down_1), tl.load(view + 2 * down_1)
@@ -617,18 +619,24 @@ def camera_of(
         tangents: of half the fields of view, across and down.
         size: (width, height).
     """
-    numbers = view.new_empty(28)
-    pose, intrinsics = numbers[:16], numbers[16:25]
+    centre = centre.reshape(3)
+    # One allocation, in which each part begins at a multiple of 16 bytes.
+    numbers = view.new_empty(32)
+    pose = numbers.as_strided((1, 4, 4), (16, 4, 1), 0)
+    intrinsics = numbers.as_strided((1, 3, 3), (9, 3, 1), 16)
+    position = numbers.as_strided((1, 3), (3, 1), 28)
     launch(
         _camera_kernel, (1,),
-        view, full, pose, intrinsics, *size, *view.stride(), *full.stride(), *(float(value) for value in tangents),
+        view, full, centre, pose, intrinsics, position, *size, *view.stride(), *full.stride(), *centre.stride(),
+        float(tangents[0]), float(tangents[1]),
     )  # fmt: skip
-    return DeviceCameras(pose.view(1, 4, 4), intrinsics.view(1, 3, 3), centre.reshape(1, 3).contiguous(), *size)
+    return DeviceCameras(pose, intrinsics, position, *size)
 
 
 def project(
     parameters: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
     rules: Rules = GSPLAT, numbers: Numbers = NUMBERS, first: Tensor | None = None,
+    into: Sequence[Tensor] | None = None,
 ) -> Projected:  # fmt: skip
     """Project at least one Gaussian, and evaluate its colour.
 
@@ -638,13 +646,19 @@ def project(
         with_geometry: fill in visible radii and centres.
         rules, numbers: those of `parameters`, too.
         first: (n, 1, 3) first coefficients, if they are apart.
+        into: radii, centres, depths and records to write to, as in `Projected`; None for new ones.
     """
     count, n, like = len(cameras.poses), len(parameters.means), parameters.means
-    integers = like.new_empty(count, n, 2, dtype=torch.int32)
+    if into is None:
+        into = (
+            like.new_empty(count, n, 2, dtype=torch.int32), like.new_empty(count, 0 if rules.family else n, 2),
+            like.new_empty(count, n), like.new_empty(count, n, RECORD),
+        )  # fmt: skip
+    radii, means2d, depths, records = into
     described = n if with_geometry else 0
     projected = Projected(
-        integers, like.new_empty(count, 0 if rules.family else n, 2), like.new_empty(count, n),
-        like.new_empty(count, n, RECORD), integers.new_empty(count, described), like.new_empty(count, described, 2),
+        radii, means2d, depths, records,
+        like.new_empty(count, described, dtype=torch.int32), like.new_empty(count, described, 2),
     )  # fmt: skip
     _project(parameters, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
     return projected

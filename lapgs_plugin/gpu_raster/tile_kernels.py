@@ -124,12 +124,12 @@ def sort_by_depth(
         Their order, (n,) int64 over all cameras, and the sum of tiles of each and those before it, (n,) int64.
     """
     order = torch.sort(depths.view(-1), stable=True)[1]
-    counts = torch.empty(len(order), dtype=torch.int32, device=depths.device)
+    counts = torch.empty_like(order)
     launch(
         _count_kernel, (blocks(len(order), BLOCK),),
         radii, means2d, order, counts, len(order), *grid, tile=TILE, block=BLOCK, boxed=boxed,
     )  # fmt: skip
-    return order, torch.cumsum(counts, 0)
+    return order, counts.cumsum_(0)
 
 
 def sort_by_tile(

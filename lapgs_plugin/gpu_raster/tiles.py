@@ -12,7 +12,8 @@ Where gsplat's CUDA part is built already, its sorting is used, which takes the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +22,9 @@ from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
 from lapgs_plugin.gpu_raster.records import Projected, grid_of
 from lapgs_plugin.gpu_raster.rules import Rules
+
+if TYPE_CHECKING:
+    from lapgs_plugin.gpu_raster.replay import Frame
 
 T = TypeVar("T")
 
@@ -77,12 +81,18 @@ def blend_in_tiles(
 
 
 def blend_family_in_tiles(
-    projected: Projected, background: Tensor, size: tuple[int, int], rules: Rules, mult: float
+    projected: Projected,
+    background: Tensor,
+    size: tuple[int, int],
+    rules: Rules,
+    mult: float,
+    frame: Frame | None = None,
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Sort Gaussians of one camera into tiles, front to back, and blend them by the family's rules.
 
     Args:
         background, size, rules, mult: as `blend_family` takes them.
+        frame: that they were projected to.
 
     Returns:
         Offsets and Gaussians of pairs as `blend_family` takes them, and its results.
@@ -94,6 +104,9 @@ def blend_family_in_tiles(
     from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     radii, means2d, depths, records = projected[:4]
+    key = records.device, *size, rules
+    if frame is not None:
+        return _with_room(key, frame.sort(), partial(frame.blend, background))
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid, True)
 
@@ -101,7 +114,7 @@ def blend_family_in_tiles(
         tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, room, True)
         return tiles, blend_family(records, background, *tiles, size, rules, mult)
 
-    return _with_room((records.device, *size, rules), ends[-1], attempt)
+    return _with_room(key, ends[-1], attempt)
 
 
 def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
@@ -135,23 +148,37 @@ def _rounded(pairs: float) -> int:
     return min(max(-(-int(pairs) // step), 1) * step, MOST_PAIRS)
 
 
+_Slot = tuple[Tensor, torch.cuda.Event]
+_free_slots: dict[torch.device, list[_Slot]] = {}  # each takes the processor longer to make than to use
+
+
 class _LateNumber:
     """Copy a number from a device to page-locked memory, to be read when the device has arrived there."""
 
     def __init__(self, number: Tensor) -> None:
         self._value: int | None = None
-        self._copied: torch.cuda.Event | None = None
+        self._number, self._slot = number, None
         if number.is_cuda:
-            self._copy = torch.empty_like(number, device="cpu", pin_memory=True).copy_(number, non_blocking=True)
-            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
-            self._copied.record(torch.cuda.current_stream(number.device))
-        else:
-            self._copy = number
+            free = _free_slots.setdefault(number.device, [])
+            self._slot = free.pop() if free else _new_slot(number)
+            copy, copied = self._slot
+            copy.copy_(number, non_blocking=True)
+            copied.record(torch.cuda.current_stream(number.device))
 
     def read(self) -> int:
         """Return the number; the first time, wait for it."""
         if self._value is None:
-            if self._copied is not None:
-                self._copied.synchronize()
-            self._value = int(self._copy)
+            if self._slot is None:
+                self._value = int(self._number)
+            else:
+                copy, copied = self._slot
+                copied.synchronize()
+                self._value = int(copy)
+                _free_slots[self._number.device].append(self._slot)
         return self._value
+
+
+def _new_slot(number: Tensor) -> _Slot:
+    """Return page-locked memory for a number, and an event."""
+    with torch.inference_mode(False):  # it is written to in other modes, too
+        return torch.empty_like(number, device="cpu", pin_memory=True), torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's

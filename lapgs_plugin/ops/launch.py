@@ -60,39 +60,45 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants:
         with torch.cuda.device(device):
             launch(kernel, programs, *arguments, **constants)
         return
-    start = _start_of(kernel, arguments, constants) if STARTS_DIRECTLY else None
-    if start is None:
-        kernel[programs](*arguments, **constants, **FUSED)
-    else:
-        start(programs, arguments)
+    if STARTS_DIRECTLY and _start_directly(kernel, device, programs, arguments, constants):
+        return
+    kernel[programs](*arguments, **constants, **FUSED)
 
 
-def _start_of(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
-    """Return a function that starts a kernel for arguments of these types; None if Triton has to."""
+def _start_directly(
+    kernel: Any, device: int, programs: tuple[int, ...], arguments: tuple[Any, ...], constants: dict[str, Any]
+) -> bool:
+    """Start a kernel past Triton's own launch; return False, and start nothing, if only Triton can."""
     if not isinstance(kernel, triton.JITFunction) or _heard(HOOKS.launch_enter_hook) or _heard(HOOKS.launch_exit_hook):
-        return None
-    addresses = 0
+        return False
+    # Of a tensor only the address is passed on. Otherwise Triton asks for it again, and CUDA whether it is one.
+    numbers: list[Any] = []
     kinds: list[Any] = []
+    addresses = 0
     for argument in arguments:
         kind = type(argument)
         if kind is float:
-            kinds.append(kind)
+            numbers.append(argument)
         elif kind is int:
             if not -(2**31) <= argument < 2**31:
-                return None
-            kinds.append(kind)
+                return False
+            numbers.append(argument)
         else:
-            addresses |= argument.data_ptr()
-            kinds.append(argument.dtype)
+            kind = argument.dtype
+            address = argument.data_ptr()
+            addresses |= address
+            numbers.append(address)
+        kinds.append(kind)
     if addresses % 16 != 0:
-        return None
-    device = triton.runtime.driver.active.get_current_device()
+        return False
     key = (kernel.fn, device, *kinds, *constants, *constants.values())
-    try:
-        return _starts[key]
-    except KeyError:
-        _starts[key] = _compiled(kernel, device, arguments, constants)
-        return _starts[key]
+    if key not in _starts:
+        _starts[key] = _compiled(kernel, arguments, constants)
+    start = _starts[key]
+    if start is None:
+        return False
+    start(programs, numbers)
+    return True
 
 
 def _heard(hook: Any) -> bool:
@@ -100,8 +106,8 @@ def _heard(hook: Any) -> bool:
     return bool(getattr(hook, "calls", hook))
 
 
-def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
-    """Compile a kernel, and return a function that starts it; None if Triton has to."""
+def _compiled(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Start | None:
+    """Compile a kernel for the current device, and return a function that starts it; None if Triton has to."""
     parameters = kernel.params[: len(arguments)]
     specialized = [
         isinstance(argument, int) and not parameter.do_not_specialize
@@ -114,11 +120,12 @@ def _compiled(kernel: Any, device: int, arguments: tuple[Any, ...], constants: d
     names = kernel.arg_names[len(arguments) :]
     # Before Triton 3.3 constants are not passed on.
     last = [constants[name] for name in names] if len(compiled.src.signature) == len(kernel.params) else []
-    stream_of = triton.runtime.driver.active.get_current_stream
+    driver = triton.runtime.driver.active
+    stream_of, device = driver.get_current_stream, driver.get_current_device()
 
-    def start(programs: tuple[int, ...], arguments: tuple[Any, ...]) -> None:
+    def start(programs: tuple[int, ...], numbers: list[Any]) -> None:
         x, y, z = (*programs, 1, 1)[:3]
-        run(x, y, z, stream_of(device), function, metadata, None, None, None, *arguments, *last)
+        run(x, y, z, stream_of(device), function, metadata, None, None, None, *numbers, *last)
 
     return start
 

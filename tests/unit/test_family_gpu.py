@@ -232,6 +232,61 @@ for key, value in found[0].items():
     assert relative(found[1][key], value) < 1e-6, key  # worst seen 1e-7
 """
 
+REPLAYED = """
+from lapgs_plugin.gpu_raster import replay
+
+whole = random_case(20_000, 160, 90, seed=5, sh_degree=1, background=COLORED, pixels=(0.5, 6.0)).to(torch.float32)
+
+
+def of(n):
+    return replace(whole, field=whole.field.with_parameters({k: v[:n] for k, v in whole.field.parameters.items()}))
+
+
+def render(case, replayed):
+    replay.ENABLED = replayed
+    inputs = inputs_of(case, DEVICE, columns=4)
+    return inputs, gpu.rasterize(settings_of(case, DEVICE), inputs, Options(sums=("counts",), inverse_depth=True))
+
+
+def differentiate(view, **how):
+    inputs, output = view
+    for value in inputs:
+        if value is not None:
+            value.grad = None
+    (output.image.square().sum() + output.inverse_depths.sum()).backward(**how)
+    return view
+
+
+def check(name, view, expected):
+    for key in ("image", "inverse_depths", "radii", "centres", "depths"):
+        assert torch.equal(getattr(view[1], key), getattr(expected[1], key)), (name, key)
+    assert torch.equal(view[1].sum("counts"), expected[1].sum("counts")), name
+    by = gradients(view[0])
+    for key, value in gradients(expected[0]).items():
+        assert relative(by[key], value) < 1e-5, (name, key)  # sums over pixels have no order
+
+
+sizes = 20_000, 19_000, 17_000, 20_000
+expected = {n: differentiate(render(of(n), False)) for n in sizes}
+for i in range(3):
+    check(f"view {i}", differentiate(render(whole, True)), expected[20_000])
+for n in sizes:  # a frame has room for all of them
+    check(n, differentiate(render(of(n), True)), expected[n])
+# Two views at once, one of which is differentiated twice.
+first, second = render(of(19_000), True), render(whole, True)
+check("second", differentiate(second, retain_graph=True), expected[20_000])
+check("first", differentiate(first, retain_graph=True), expected[19_000])
+third = render(of(17_000), True)
+check("first again", differentiate(first), expected[19_000])
+check("third", differentiate(third), expected[17_000])
+# Room for pairs that does not suffice.
+for key in tiles._rooms:
+    tiles._rooms[key] = 1.0
+check("little room", differentiate(render(whole, True)), expected[20_000])
+assert len(replay._frames._by_kind) == 1
+assert not replay._broken, replay._broken
+"""
+
 needs_triton = pytest.mark.skipif(
     importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only"
 )
@@ -262,6 +317,12 @@ def test_sums_over_pixels_interpreted_against_the_engine_of_the_cpu() -> None:
 @needs_cuda
 def test_compiled() -> None:
     run_checks("cuda", f"NAMES = []\n{COMMON}{LIMITS}{PLAIN}{OPTIONS}{SUMS_OVER_PIXELS}{CHANGED_IN_PLACE}")
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_views_by_graphs_equal_those_without() -> None:
+    run_checks("cuda", COMMON + REPLAYED)
 
 
 @needs_triton

@@ -31,7 +31,8 @@ class Launcher:
 
     def __call__(self, x, y, z, stream, function, metadata, launch_metadata, enter, leave, *arguments):
         hooks.append(enter)
-        started.append((self.kernel, (x, y, z), stream, function, metadata, arguments))
+        addresses = [each.data_ptr() if isinstance(each, torch.Tensor) else each for each in arguments]
+        started.append((self.kernel, (x, y, z), stream, function, metadata, addresses))
 
 class Utils:
     def load_binary(self, name, binary, shared, device):
