@@ -15,7 +15,17 @@ import pytest
 gc.set_threshold(10_000, 20, 20)
 
 SHARED_DATA = Path(os.environ.get("LAPGS_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
-MODULES_OF_EXTRAS = ("cv2", "imageio_ffmpeg", "mkdocs", "pillow_heif", "playwright", "pyarrow", "safetensors", "viser")
+MODULES_OF_EXTRAS = (
+    "cv2",
+    "imageio_ffmpeg",
+    "mkdocs",
+    "pillow_heif",
+    "playwright",
+    "pyarrow",
+    "safetensors",
+    "viser",
+    "zstandard",
+)
 
 
 @pytest.fixture

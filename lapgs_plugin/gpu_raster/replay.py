@@ -30,7 +30,7 @@ Tiles = tuple[Tensor, Tensor]
 Blending = tuple[Tensor, Tensor, Tensor, Tensor]
 """Results of `blend_kernels.blend_family`."""
 
-ENABLED = False
+ENABLED = True
 """Whether views are replayed at all."""
 REPEATED = 3
 """Views of the same kind from which on they are replayed."""

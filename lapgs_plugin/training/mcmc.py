@@ -1,6 +1,6 @@
 """Density control as a Markov chain (Kheradmand et al. 2024): move Gaussians that have become transparent, add some up
 to a limit, and shake positions. Unlike theirs, it moves and adds them where images are wrong, removes transparent
-Gaussians of residuals instead of moving them, and bounds the sizes of finer levels on large images.
+Gaussians of residuals instead of moving them, and bounds the sizes of residuals on large images.
 
 In plain PyTorch, so that a CPU trains with it as well; gsplat has the same steps for CUDA alone.
 """
@@ -61,11 +61,6 @@ MOST_SIGMA = 32.0
 """Largest standard deviation, in pixels, of a residual's Gaussians on a large image. The loss has the mean opacity, so
 that faint Gaussians grow, and those that cover whole views take time and memory in each of its tiles. Detail that is
 so coarse is the base's."""
-MOST_NESTED_SIGMA = 64.0
-"""The same of a nested level's Gaussians that a coarser level trained before, where it is half as many pixels. The few
-larger ones make most pairs of Gaussian and tile, which take most of the memory."""
-NESTED_PIXELS = 2_500_000
-"""Pixels of an image from which on a nested level has this bound."""
 
 
 def mcmc_start(field: GaussianField, scale: float) -> GaussianField:
@@ -132,8 +127,8 @@ class McmcDensifier(DensityControl):
         if iteration - self.state["noised"] >= NOISE_VIEWS:
             shake(model, NOISE * math.sqrt(self.state["variance"]) / self._unit**2)
             self.state |= {"noised": iteration, "variance": 0.0}
-            if (most := most_sigma(model.signed, self._schedule.before > 0, camera.size)) is not None:
-                bound_sizes(model, camera, most, NEAR_DEPTH * self._unit)
+            if model.signed and is_large(camera.size):
+                bound_sizes(model, camera, MOST_SIGMA, NEAR_DEPTH * self._unit)
         return refines
 
     def opacity_weight(self, model: TrainableField, iteration: int) -> float:
@@ -252,19 +247,6 @@ def shake(model: TrainableField, amount: float) -> None:
     rows = (torch.sigmoid(logits) < SOLID).nonzero()[:, 0]  # a GPU would wait for their number
     noise = torch.randn(len(rows), 3, dtype=means.dtype)
     means[rows] += displacements(quaternions[rows], log_scales[rows], logits[rows], noise, amount)
-
-
-def most_sigma(signed: bool, continued: bool, size: tuple[int, int]) -> float | None:
-    """Return the bound on a stage's standard deviations in pixels, None where there is none.
-
-    Args:
-        signed: whether its field is a residual.
-        continued: whether its field was trained before, by a coarser nested level.
-        size: of its images.
-    """
-    if signed:
-        return MOST_SIGMA if is_large(size) else None
-    return MOST_NESTED_SIGMA if continued and size[0] * size[1] >= NESTED_PIXELS else None
 
 
 @torch.no_grad()
