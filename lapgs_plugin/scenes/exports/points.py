@@ -14,8 +14,10 @@ from lapgs_plugin.scenes.exports.base import Array, Shot
 from lapgs_plugin.scenes.images import read_depth, read_image
 from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
 
-TRIED_POINTS, TRIED_SHOTS = 2_000, 50
-"""Most points, and about how many cameras, that are compared."""
+TRIED_POINTS = 2_000
+"""Most points that are compared."""
+TRIED_SHOTS = 50
+"""About how many cameras they are compared with."""
 SEEN = 0.1
 """Share of points that cameras see at least if both are in the same coordinates."""
 DEPTH_SHOTS = 40

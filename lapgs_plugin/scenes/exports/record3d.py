@@ -72,9 +72,9 @@ class Record3D(SceneReader):
 def _lens(source: Path, values: dict[str, Any], index: int) -> pycolmap.Camera:
     """Return the lens of a photo, else that of all."""
     size = size_of(values.get("w"), values.get("h"), str(source))
-    each = values.get("perFrameIntrinsicCoeffs")
-    if isinstance(each, list) and index < len(each):
-        fx, fy, cx, cy = numbers(each[index], 4, f"{source}: intrinsics {index}")
+    per_photo = values.get("perFrameIntrinsicCoeffs")
+    if isinstance(per_photo, list) and index < len(per_photo):
+        fx, fy, cx, cy = numbers(per_photo[index], 4, f"{source}: intrinsics {index}")
     else:
         fx, _, _, _, fy, _, cx, cy, _ = numbers(values.get("K"), 9, f"{source}: K")  # by columns
     return perspective(size, (fx, fy), (cx, cy), where=str(source))

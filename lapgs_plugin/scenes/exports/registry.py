@@ -84,20 +84,20 @@ def find_export(folder: Path) -> FoundExport | None:
     Raises:
         SceneError: there are several.
     """
-    found = [(name, source) for name in SCENE_READERS if (source := SCENE_READERS[name]().find(folder)) is not None]
-    if len(found) > 1:
-        some = " and ".join(f"{source.name} ({SCENE_READERS[name].title})" for name, source in found[:2])
+    exports = [(name, source) for name in SCENE_READERS if (source := SCENE_READERS[name]().find(folder)) is not None]
+    if len(exports) > 1:
+        some = " and ".join(f"{source.name} ({SCENE_READERS[name].title})" for name, source in exports[:2])
         raise SceneError(f"{folder}: it holds {some}, expected one of them; move the other elsewhere")
-    return FoundExport(*found[0]) if found else None
+    return FoundExport(*exports[0]) if exports else None
 
 
-def read_export(found: FoundExport, path: Path, images: str, evaluate: bool) -> SceneSource:
+def read_export(export: FoundExport, path: Path, images: str, evaluate: bool) -> SceneSource:
     """Read the frames and points of an export, of which `evaluate` holds out every eighth.
 
     Raises:
         SceneError: it cannot be read, or a camera is distorted.
     """
-    model, source = found.read(path, images)
+    model, source = export.read(path, images)
     refuse_distorted(model, path)
     train, test = hold_out(source.train, evaluate)
     return replace(source, train=train, test=test)

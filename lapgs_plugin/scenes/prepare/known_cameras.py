@@ -194,9 +194,9 @@ def _from_transforms(cameras: Path, photos: Path) -> tuple[Model, SceneSource, P
 
 def _from_export(cameras: Path, photos: Path) -> tuple[Model, SceneSource, Path]:
     """Return a model of another program's export, its frames and points, and the folder of its photos."""
-    found = find_export(cameras)
-    assert found is not None  # `find_known_cameras` has found it
-    model, source = found.read(photos)
+    export = find_export(cameras)
+    assert export is not None  # `find_known_cameras` has found it
+    model, source = export.read(photos)
     _check_lenses(model)
     short = _without_top(source)
     names = {long.name: frame.name for long, frame in zip(source.train, short.train, strict=True)}
