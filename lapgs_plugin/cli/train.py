@@ -103,7 +103,7 @@ def train(
         if not run.resumes:
             masks = run.archive.manifest.scene.masks
             length = run.settings.iterations if run.settings.time is None else None
-            write_config(path, context, masks=masks, iterations=length)
+            write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
         elif run.settings.extended:
             extended = extended_config(path, run.settings)
         _train(run, watcher)

@@ -14,6 +14,9 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 
+BEHIND_CAMERA = 1e-12
+"""Depth up to which no rasterizer blends a Gaussian, and whose inverse could overflow."""
+
 
 @dataclass(frozen=True)
 class RenderResult:
@@ -218,6 +221,18 @@ def render_depths(rasterizer: Rasterizer, field: GaussianField, camera: Camera) 
     """
     depths = camera.local(field.means)[:, 2]
     values = torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1)
+    blended, opacity, _ = render_values(rasterizer, field, camera, values)
+    return blended, opacity
+
+
+def render_inverse_depths(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return blended inverse depths and opacity, (height, width) each, differentiable.
+
+    The background is infinitely far away. Depths are as in `render_depths`.
+    """
+    depths = camera.local(field.means)[:, 2]
+    inverse = torch.where(depths > BEHIND_CAMERA, depths, 1.0).reciprocal()  # what lies behind is not blended
+    values = torch.stack([inverse, torch.ones_like(inverse), torch.zeros_like(inverse)], 1)
     blended, opacity, _ = render_values(rasterizer, field, camera, values)
     return blended, opacity
 

@@ -249,6 +249,29 @@ def mask_folder(path: Path) -> str | None:
     return folder.as_posix()
 
 
+def depth_files(path: Path, images: str = "images") -> dict[str, Path]:
+    """Return the depth maps that transforms files name by `depth_file_path`, by the names of their photos.
+
+    Args:
+        path: the scene folder.
+        images: folder of the images, as `read_transforms` takes it.
+
+    Raises:
+        SceneError: a file is unreadable.
+    """
+    inside, maps = os.path.normpath(path), dict[str, Path]()
+    for file in (path / name for name in (SINGLE_FILE, TRAIN_FILE, *TEST_FILES) if is_file(path / name)):
+        for frame in _read_json(file)["frames"]:
+            photo, depth = (
+                (frame.get(f"{of}file_path") for of in ("", "depth_")) if isinstance(frame, dict) else ("", "")
+            )
+            if isinstance(photo, str) and isinstance(depth, str) and depth:
+                image = _image_path(path, _portable(photo), images)
+                name = image.relative_to(inside).as_posix() if image.is_relative_to(inside) else image.name
+                maps[name] = path / _portable(depth)
+    return maps
+
+
 def _read_json(file: Path) -> Values:
     values = read_json(file, error=SceneError, advice="export the scene again", finite=False)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:

@@ -187,11 +187,13 @@ def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
     """Read the first channel of a depth map, (h, w); floating-point values as they are, integers times `unit`.
 
     Raises:
-        SceneError: the file is missing, no image, or has more pixels than `limits.PHOTO_PIXELS`.
+        SceneError: the file is missing, no image, a picture in colours, or has more pixels than `limits.PHOTO_PIXELS`.
     """
     source = _open(path, pixels=True)
     _image_plane(path, source)
     spec = source.spec()
+    if spec.nchannels > 2 and spec.format.basetype not in FLOAT_FORMATS:
+        raise SceneError(f"{path}: a picture in colours, expected a depth map: numbers in one channel")
     values = _read_rows(path, source, 0, spec.height, 1)[:, :, 0]
     if spec.format.basetype in FLOAT_FORMATS:
         return values

@@ -65,7 +65,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
     masks = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
     if missing := [shorter[name] for name, path in masks.items() if path is None]:
-        stem = _stem(missing[0])
+        stem = stem_of(missing[0])
         raise SceneError(
             f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
             f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
@@ -99,7 +99,7 @@ def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None
 
 
 def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | None:
-    stem = _stem(name)
+    stem = stem_of(name)
     whole = [name] if stem != name else [f"{name}{suffix}" for suffix in SUFFIXES]  # a checkout's name without suffix
     spellings = [f"{name}.png" for name in whole]
     spellings += [f"{stem}{end}{suffix}" for end in ("", "_mask") for suffix in SUFFIXES]
@@ -112,7 +112,8 @@ def _mask_of(folder: Path, present: dict[str, list[Path]], name: str) -> Path | 
     return files[0] if files else None
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
+    """Return the name of a photo without its suffix."""
     path = PurePosixPath(name)
     return path.with_suffix("").as_posix() if has_photo_suffix(path) else name
 

@@ -19,6 +19,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.gpu_busy import require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
+from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import resolve_masks, share_inside
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.scene import Scene
@@ -97,7 +98,9 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     Raises:
         LapgsError: the request, the scene, the run folder or the machine does not allow the run.
     """
-    photos = request.photos
+    photos, settings = request.photos, request.settings
+    depth = resolve_depth(Path(request.scene), settings.depth)
+    request = replace(request, settings=replace(settings, depth=depth))
     masks = resolve_masks(Path(request.scene), photos.masks)
     reference = SceneReference(
         path=str(request.scene),
@@ -139,10 +142,11 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     scene = load_reference(reference, decide, hold=settings.images_on != "disk")
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
+    depth = load_depth(scene, settings.depth, reference.images, say)
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     with RunArchive.create(out, manifest, request.overwrite) as archive:
-        run = PreparedRun.of(scene, settings, archive, placed, request.control, began=request.began)
+        run = PreparedRun.of(scene, settings, archive, placed, request.control, began=request.began, depth=depth)
         _say_about_photos(run, say)
         yield run
 
@@ -200,7 +204,10 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
             scene = load_reference(replace(manifest.scene, path=str(scene_folder)), hold=settings.images_on != "disk")
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
-            run = PreparedRun.of(scene, settings, archive, placed, request.control, resumes=True, began=began)
+            depth = load_depth(scene, settings.depth, manifest.scene.images, say)
+            run = PreparedRun.of(
+                scene, settings, archive, placed, request.control, resumes=True, began=began, depth=depth
+            )
         if began is not None:
             archive.change_settings({"time": settings.time})
         _say_about_photos(run, say)

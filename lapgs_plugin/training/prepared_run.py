@@ -17,6 +17,7 @@ from lapgs_plugin.ops.mixed_sizes import similar_sizes
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.scenes.depth import DepthTargets
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.stages.run import StagedRun
 from lapgs_plugin.training.densification import DensityControl, control_of
@@ -41,6 +42,7 @@ class PreparedRun(StagedRun):
         resumes: whether the run continues from its checkpoint, or after its last finished level.
         first_field: the first stage starts from it; None starts from the scene's points.
         began: when the seconds of --time began, by `time.monotonic`; None goes on with those that are left.
+        depth: of the training views; None without.
     """
 
     settings: TrainSettings
@@ -51,6 +53,7 @@ class PreparedRun(StagedRun):
     resumes: bool
     first_field: GaussianField | None
     began: float | None
+    depth: DepthTargets | None
 
     @classmethod
     def of(
@@ -64,6 +67,7 @@ class PreparedRun(StagedRun):
         resumes: bool = False,
         first_field: GaussianField | None = None,
         began: float | None = None,
+        depth: DepthTargets | None = None,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
 
@@ -72,8 +76,8 @@ class PreparedRun(StagedRun):
             settings: of the run.
             archive: open for writing.
             placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
-            control, resumes, first_field, began: see the attributes; by default the run is new and starts from the
-                points, and a time begins with the training.
+            control, resumes, first_field, began, depth: see the attributes; by default the run is new, starts
+                from the points without depth, and a time begins with the training.
 
         Raises:
             UserInputError: as `make_plan`.
@@ -93,6 +97,7 @@ class PreparedRun(StagedRun):
             resumes=resumes,
             first_field=first_field,
             began=began,
+            depth=depth,
         )
         # With --time their lengths were decided by the clock.
         for record in archive.manifest.records if settings.time is not None else ():

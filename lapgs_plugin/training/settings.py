@@ -225,6 +225,13 @@ class TrainSettings(HierarchySettings):
         panel=SCHEDULE,
         choices=(AUTO, ON, OFF),
     )
+    depth: str = option(
+        AUTO,
+        "Supervise depth in all levels but residuals: a folder of depth maps named as the photos (16-bit PNG, EXR, "
+        "NPY), points (those of COLMAP that a photo sees), none, or auto (depth_file_path of transforms.json, the "
+        "scene's folder depth/ or that of an export, or none).",
+        panel=SCHEDULE,
+    )
     refine_poses: bool = option(
         False,
         "Refine the pose of each training photo while the field trains, for inaccurate poses. Views are then rendered "
@@ -458,6 +465,7 @@ class TrainSettings(HierarchySettings):
                 "sh_rate_factor": 1.0,
                 "decay": 1.0,
                 "exposure": OFF,
+                "depth": "none",
                 "refine_poses": False,
             },
             "dropout": 0.0,

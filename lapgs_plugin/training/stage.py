@@ -25,6 +25,7 @@ from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
+from lapgs_plugin.training.depth import StageDepth, depth_weight
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
@@ -93,6 +94,7 @@ class StageRun:
         densifier: density control with its statistics.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
+        depth: supervises it; None without depth and in residuals.
         record: measures it.
         budget: decides the stage's length by the clock; None where it is planned.
         say: shows a line to the user.
@@ -114,6 +116,7 @@ class StageRun:
     densifier: DensityControl
     exposures: ViewExposures | None
     poses: ViewPoses | None
+    depth: StageDepth | None
     record: StageRecord
     say: Callable[[str], None]
     budget: StageBudget | None = None
@@ -388,7 +391,7 @@ class StageRun:
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
         self._breakdown.mark("loss")
-        loss = loss_of(rendered, shown)
+        loss = self._with_depth(loss_of(rendered, shown), names, cameras, shown, last)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         kept = loss.detach()
         if result is not None:
@@ -403,6 +406,14 @@ class StageRun:
             scale_to_last(result, [camera.size for camera in cameras])
         self._breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
+
+    def _with_depth(
+        self, loss: Tensor, names: Sequence[str], cameras: Sequence[Camera], shown: GaussianField, iteration: int
+    ) -> Tensor:
+        """Return the mean loss of some views with that of their depth, if they have any."""
+        if self.depth is None or (of_depth := self.depth.loss(names, cameras, shown)) is None:
+            return loss
+        return loss + depth_weight(self.prepared.plan, self.stage, iteration) * of_depth
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Call the hooks that come before a render; return the loss of some views by all hooks."""

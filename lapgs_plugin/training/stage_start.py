@@ -22,6 +22,7 @@ from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
+from lapgs_plugin.training.depth import StageDepth
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
@@ -29,6 +30,7 @@ from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import OFF
+from lapgs_plugin.training.views import level_views
 
 
 def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
@@ -121,6 +123,14 @@ def first_poses(run: PreparedRun, stage: Stage) -> ViewPoses | None:
     levels, scene, done = run.archive.available_levels, run.scene, run.plan.iterations_before(stage.level)
     start = (run.archive.poses(levels[-1]) if levels else None) or {}
     return ViewPoses.create(scene.train, start, scene.extent, run.device, done, run.plan.iterations)
+
+
+def stage_depth(run: PreparedRun, stage: Stage) -> StageDepth | None:
+    """Return the supervision of depth in a stage; None without depth, and for a residual, which has none."""
+    if run.depth is None or stage.signed:
+        return None
+    cameras = {view.name: view.camera for view in level_views(run.scene.train, stage.level)}
+    return StageDepth.create(run.depth, cameras, run.rasterizer, run.device)
 
 
 def first_exposures(
