@@ -252,7 +252,7 @@ def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str,
     values = {view.name: result for view, result in zip(views, results, strict=True) if isinstance(result, Tensor)}
     problems = [result for result in results if isinstance(result, SceneError)]
     if not values:
-        raise SceneError(f"none of the {counted(len(problems), 'depth map')} can be used, the first: {problems[0]}")
+        raise SceneError(f"{where}: no depth map can be used, of {len(files)}; the first: {problems[0]}; {MAPS_ADVICE}")
     if problems:
         others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         say(f"depth: {counted(len(problems), 'map')} not used, the first: {problems[0]}{others}")
@@ -294,7 +294,7 @@ def _read_map(file: Path, view: View) -> Tensor:
     if not same_shape((width, height), size):
         raise SceneError(
             f"{file}: the depth map is {width}x{height} pixels, its photo {size[0]}x{size[1]}; expected the same "
-            f"aspect ratio; {MAPS_ADVICE}"
+            "aspect ratio"
         )
     values = torch.where(torch.isfinite(values) & (values > 0.0), values, torch.nan)
     largest = depth_size(size)
@@ -305,9 +305,7 @@ def _read_map(file: Path, view: View) -> Tensor:
         inside = F.interpolate(view.mask[None].float(), tuple(values.shape), mode="area")[0, 0]
         values = torch.where(inside >= INSIDE_SHARE, values, torch.nan)
     if int((~values.isnan()).sum()) < LEAST_PIXELS:
-        raise SceneError(
-            f"{file}: fewer than {LEAST_PIXELS} of its pixels are valid, expected numbers above 0; {MAPS_ADVICE}"
-        )
+        raise SceneError(f"{file}: fewer than {LEAST_PIXELS} of its pixels are valid, expected numbers above 0")
     return values
 
 
@@ -331,7 +329,7 @@ def _read_numbers(file: Path) -> NDArray[np.float32]:
         with np.errstate(over="ignore"):  # of float64, as inf
             return np.array(array, np.float32).reshape(shape)
     except (OSError, ValueError, EOFError) as error:
-        raise SceneError(f"{file}: the depth map cannot be read ({first_line(error)}); {MAPS_ADVICE}") from error
+        raise SceneError(f"{file}: the depth map cannot be read ({first_line(error)})") from error
 
 
 def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:

@@ -1,7 +1,7 @@
 """Supervise the depth of a field: maps beside the photos, or the points that they see.
 
-Blended inverse depth is compared with that of the view, as in "A Hierarchical 3D Gaussian Representation" (Kerbl et al.
-2024). Residuals have no depth: in a hierarchy of them, the base alone is supervised.
+Inverse depth is compared with that of the view, as in "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024).
+Residuals have no depth: in a hierarchy of them, the base alone is supervised.
 """
 
 from __future__ import annotations
@@ -21,6 +21,20 @@ from lapgs_plugin.scenes.depth import DepthTargets, depth_size
 
 FIRST_WEIGHT, LAST_WEIGHT = 1.0, 0.01
 """Weight of the depth loss at the start and the end of the supervised iterations; its logarithm falls linearly."""
+
+LEAST_OPACITY = 0.01
+"""Opacity of a pixel below which its loss fades out."""
+EVERY = 2
+"""Iterations from one with depth to the next, whose loss counts as often: a depth costs about as much as an image."""
+
+
+def mean_inverse_depth(rasterizer: Rasterizer, gaussians: GaussianField, camera: Camera) -> Tensor:
+    """Return a pixel's mean inverse depth (h, w), by the opacities of what it shows, differentiable.
+
+    The blended one would not do: something nearer that is less opaque has the same.
+    """
+    inverse, opacity = render_inverse_depths(rasterizer, gaussians, camera)
+    return inverse / opacity.clamp_min(LEAST_OPACITY)
 
 
 def depth_loss(inverse: Tensor, target: Tensor) -> Tensor:
@@ -61,20 +75,23 @@ class StageDepth:
         names = [name for name in depth.names if name in cameras]
         return cls(rasterizer, {name: depth.inverse(name, depth_size(cameras[name].size)).to(device) for name in names})
 
-    def loss(self, names: Sequence[str], cameras: Sequence[Camera], gaussians: GaussianField) -> Tensor | None:
-        """Return the mean loss of some views, without weight; None if none has depth.
+    def loss(
+        self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera], gaussians: GaussianField
+    ) -> Tensor | None:
+        """Return the mean loss of some views, without weight; None if it is due in none of them.
 
         Args:
+            iterations: of the stage that train the views.
             names: of the views.
             cameras: theirs at the level's size.
             gaussians: the field.
         """
         losses = [
-            depth_loss(render_inverse_depths(self.rasterizer, gaussians, self._camera(name, camera))[0], target)
-            for name, camera in zip(names, cameras, strict=True)
-            if (target := self.targets.get(name)) is not None
+            depth_loss(mean_inverse_depth(self.rasterizer, gaussians, self._camera(name, camera)), target)
+            for iteration, name, camera in zip(iterations, names, cameras, strict=True)
+            if iteration % EVERY == 0 and (target := self.targets.get(name)) is not None
         ]
-        return torch.stack(losses).sum() / len(names) if losses else None
+        return EVERY * torch.stack(losses).sum() / len(names) if losses else None
 
     def _camera(self, name: str, camera: Camera) -> Camera:
         """Return a view's camera at the size of its target, the same object for the same camera."""

@@ -391,7 +391,7 @@ class StageRun:
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
         self._breakdown.mark("loss")
-        loss = self._with_depth(loss_of(rendered, shown), names, cameras, shown, last)
+        loss = self._with_depth(loss_of(rendered, shown), iterations, views, shown)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         kept = loss.detach()
         if result is not None:
@@ -408,12 +408,13 @@ class StageRun:
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
     def _with_depth(
-        self, loss: Tensor, names: Sequence[str], cameras: Sequence[Camera], shown: GaussianField, iteration: int
+        self, loss: Tensor, iterations: Sequence[int], views: Sequence[LevelView], shown: GaussianField
     ) -> Tensor:
         """Return the mean loss of some views with that of their depth, if they have any."""
-        if self.depth is None or (of_depth := self.depth.loss(names, cameras, shown)) is None:
+        names, cameras = [view.name for view in views], [view.camera for view in views]
+        if self.depth is None or (of_depth := self.depth.loss(iterations, names, cameras, shown)) is None:
             return loss
-        return loss + depth_weight(self.prepared.plan, self.stage, iteration) * of_depth
+        return loss + depth_weight(self.prepared.plan, self.stage, iterations[-1]) * of_depth
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Call the hooks that come before a render; return the loss of some views by all hooks."""
