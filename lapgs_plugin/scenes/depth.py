@@ -21,6 +21,7 @@ from lapgs_plugin.scenes.blender import depth_files, has_transforms
 from lapgs_plugin.scenes.colmap import find_model, with_bare_names
 from lapgs_plugin.scenes.colmap_model import Model, read_model
 from lapgs_plugin.scenes.exports.points import MILLIMETRES
+from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.image_files import check_size
 from lapgs_plugin.scenes.images import read_depth, same_shape
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, stem_of
@@ -31,8 +32,9 @@ from lapgs_plugin.untrusted import require_regular
 POINTS, TRANSFORMS = "points", "transforms"
 """Values of --depth, beside auto, none and a folder."""
 DEPTH_PATHS = "depth_file_path of transforms.json"
-FOLDERS = ("depth", "keyframes/depth", "highres_depth", "lowres_depth")
-"""Where depth maps lie: beside photos and in Record3D's exports; in Polycam's; in ARKitScenes'."""
+"""Where maps of `TRANSFORMS` are named, for messages."""
+FOLDERS = ("depth", "highres_depth", "lowres_depth")
+"""Folders of depth maps beside that of the photos; in exports the first is Record3D's and Polycam's, others ARKit's."""
 SUFFIXES = (".npy", ".exr", ".tiff", ".tif", ".png")
 """Of depth maps; of several for a photo the first is read, because pictures of depth lie beside the numbers."""
 ENDS = ("", "_depth")
@@ -62,9 +64,9 @@ MADE_UP = 0.5
 BEHIND = 1.1
 """Depth over that of the nearest point of the cell up to which a point is taken to be visible."""
 
-MAPS_ADVICE = "correct them, or train without (--depth none)"
-_SOME_MAPS = 8
+MAP_THREADS = 8
 """Threads that read maps."""
+MAPS_ADVICE = "correct them, or train without (--depth none)"
 
 Say = Callable[[str], None]
 
@@ -144,14 +146,25 @@ def resolve_depth(scene: Path, setting: str) -> str:
         UserInputError: there is no such folder.
     """
     if setting == AUTO:
-        if find_model(scene) is None and has_transforms(scene) and depth_files(scene):
-            return TRANSFORMS
-        return next((folder for folder in FOLDERS if is_folder(scene / folder)), NONE)
+        return _own_depth(scene)
     if setting in (NONE, POINTS, TRANSFORMS) or is_folder(scene / setting):
         return setting
     if not is_folder(Path(setting)):
         raise UserInputError(f"--depth {setting}: no such folder; expected a folder of depth maps, points or none")
     return str(Path(setting).absolute())
+
+
+def _own_depth(scene: Path) -> str:
+    """Return the depth that a scene brings, as a value of --depth."""
+    places = [scene]
+    if find_model(scene) is None:
+        if has_transforms(scene):
+            if depth_files(scene):
+                return TRANSFORMS
+        elif (export := find_export(scene)) is not None and export.source.is_relative_to(scene):
+            places.append(export.source.parent)
+    folders = (place / folder for place in places for folder in FOLDERS)
+    return next((folder.relative_to(scene).as_posix() for folder in folders if is_folder(folder)), NONE)
 
 
 def load_depth(scene: Scene, setting: str, images: str, say: Say) -> DepthTargets | None:
@@ -248,7 +261,7 @@ def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str,
         except SceneError as error:
             return error
 
-    results = in_threads("Reading depth maps", "maps", load, views, most=_SOME_MAPS, progress=False)
+    results = in_threads("Reading depth maps", "maps", load, views, most=MAP_THREADS, progress=False)
     values = {view.name: result for view, result in zip(views, results, strict=True) if isinstance(result, Tensor)}
     problems = [result for result in results if isinstance(result, SceneError)]
     if not values:
@@ -346,7 +359,7 @@ def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:
 def _holds_inverse_depth(maps: Mapping[str, Tensor], seen: Mapping[str, Tensor]) -> bool:
     """Return whether maps grow where the points that their photos see are nearer."""
     ranks, weights = [], []
-    for name in maps.keys() & seen.keys():
+    for name in (name for name in maps if name in seen):
         place, inverse = seen[name][:, :2], seen[name][:, 2]
         shown = _at(maps[name], place)
         valid = ~shown.isnan()

@@ -166,8 +166,8 @@ def test_only_unusable_maps_are_an_error_of_one_line(scene: Path, write: object,
 def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path) -> None:
     assert resolve_depth(scene, "auto") == "none"
     assert resolve_depth(scene, "points") == "points"
-    (scene / "keyframes" / "depth").mkdir(parents=True)  # Polycam's
-    assert resolve_depth(scene, "auto") == "keyframes/depth"
+    (scene / "lowres_depth").mkdir()
+    assert resolve_depth(scene, "auto") == "lowres_depth"
     (scene / "depth").mkdir()
     assert resolve_depth(scene, "auto") == "depth"
     (tmp_path / "maps").mkdir()

@@ -14,12 +14,14 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.scenes import load_cameras, load_scene
+from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.prepare.pipeline import prepare_scene
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
@@ -355,6 +357,19 @@ def test_points_are_made_of_depth_maps(name: str, tmp_path: Path) -> None:
     clear = np.abs(source.points[:, 0]) > 0.2  # photos are resampled to the size of the map
     red = source.colors[clear, 0] > 0.5
     assert (red == (source.points[clear, 0] < 0)).mean() > 0.99
+    scene = load_scene(tmp_path, progress=False)
+    depth = load_depth(scene, resolve_depth(tmp_path, "auto"), "images", [].append)
+    assert depth is not None
+    assert [*depth.names] == [view.name for view in scene.train]
+    for view in scene.train:
+        small, inverse = view.camera.resized(48, 32), depth.inverse(view.name, (48, 32))
+        rows, columns = torch.meshgrid(torch.arange(32) + 0.5, torch.arange(48) + 0.5, indexing="ij")
+        local = torch.stack([(columns - small.cx) / small.fx, (rows - small.cy) / small.fy, torch.ones(32, 48)], -1)
+        local = local / inverse[..., None] - small.world_to_camera[:3, 3]
+        walls = (local @ small.world_to_camera[:3, :3])[..., 2]
+        assert walls[:4, :4].isnan().all()
+        walls = walls[~walls.isnan()]
+        torch.testing.assert_close(walls, torch.full_like(walls, 5.0), atol=1e-3, rtol=0)  # worst seen 8e-5
 
 
 def _photograph(path: Path, capture: Capture, view: int, depths: str, name: str) -> None:
