@@ -37,6 +37,13 @@ class PrepareSettings:
         "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
         "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
     )
+    tripod: float = option(
+        0.0,
+        "Ignore what panoramas show within this many degrees of straight down, such as a tripod: 30. Default: 0, "
+        "ignore nothing.",
+        least=0.0,
+        most=90.0,
+    )
     camera_model: str = option(
         AUTO,
         "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
