@@ -392,7 +392,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path) -> None:
         assert not out.exists()
 
     refused(UserInputError, "--matcher: .*sparse/0 has the cameras already; leave", matcher="sequential")
-    refused(UserInputError, "--own-cameras|--single-camera: .* has the cameras already", single_camera=False)
+    refused(UserInputError, "--camera-per: .* has the cameras already", camera_per="one")
     refused(UserInputError, "--model .*empty: no model of COLMAP in it", model=tmp_path / "empty")
     refused(
         SceneError,

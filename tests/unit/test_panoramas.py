@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+import typer
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from lapgs_plugin.cli.prepare import prepare
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.scenes import load_scene
@@ -63,7 +67,7 @@ def transforms(folder: Path, names: list[str], poses: list[Array], **more: Any) 
 
 
 def run(photos: Path, out: Path, **options: Any) -> PrepareResult:
-    return prepare_scene(photos, out, PrepareSettings(**options), progress=False)
+    return prepare_scene(photos, out, PrepareSettings(**options), overwrite=True, progress=False)
 
 
 def loaded(folder: Path, **options: Any) -> Scene:
@@ -216,6 +220,95 @@ def test_photos_and_panoramas_of_one_model(tmp_path: Path) -> None:
     phone = next(view for view in scene.train if view.name == "phone.jpg")
     assert phone.mask is not None
     assert bool(phone.mask.all())
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Panoramas of four places in the room."""
+    folder = tmp_path_factory.mktemp("walked")
+    for index, pose in enumerate(walk(4)):
+        save(folder / f"{index}.jpg", panorama(room_view, pose, WIDTH))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def placed(walked: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene that the command makes of them."""
+    out = tmp_path_factory.mktemp("placed") / "scene"
+    app = typer.Typer()
+    app.command()(prepare)
+    result = CliRunner().invoke(app, [str(walked), str(out), "--tripod", "45"])
+    assert result.exit_code == 0, result.output
+    assert "4 of 4 photos" in result.output
+    assert "next: lapgs train" in result.output
+    return out
+
+
+def test_colmap_places_panoramas(placed: Path) -> None:
+    model = pycolmap.Reconstruction(placed / "sparse/0")
+    images = {image.name: image for image in model.images.values()}
+    assert set(images) == {f"{index}_f{face}.jpg" for index in range(4) for face in range(9)}
+    exact = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in walk(4)])
+    centers = np.stack([images[f"{index}_f0.jpg"].projection_center() for index in range(4)])
+    # Umeyama 1991
+    a, b = centers - centers.mean(0), exact - exact.mean(0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation, scale = u @ sign @ vt, np.trace(np.diag(values) @ sign) / (a**2).sum()
+    assert np.abs(scale * a @ rotation.T - b).max() < 0.004  # metres in a room of 6.4; worst 0.0014
+    first = images["0_f0.jpg"].cam_from_world().matrix()[:, :3]
+    for index, pose in enumerate(walk(4)):
+        for face in range(9):
+            image = images[f"{index}_f{face}.jpg"]
+            np.testing.assert_allclose(image.projection_center(), centers[index], rtol=0, atol=1e-9)
+        relative = images[f"{index}_f0.jpg"].cam_from_world().matrix()[:, :3] @ first.T
+        turned = Rotation.from_matrix(relative @ (pose[:3, :3] @ walk(4)[0][:3, :3].T).T).magnitude()
+        assert math.degrees(turned) < 0.1  # worst 0.035
+
+
+def test_points_of_placed_panoramas_are_where_their_features_are(placed: Path) -> None:
+    model = pycolmap.Reconstruction(placed / "sparse/0")
+    errors = [
+        np.linalg.norm(image.project_point(model.points3D[feature.point3D_id].xyz) - feature.xy)
+        for image in model.images.values()
+        for feature in image.points2D
+    ]
+    assert model.num_points3D() > 300  # 736 were seen
+    assert np.median(errors) < 0.5  # pixels; 0.2
+    assert len(loaded(placed).train) == 36
+    assert all(view.masked for view in loaded(placed).train)
+
+
+def metadata(folder: Path, name: str, says: bytes) -> None:
+    """Append a comment to a JPEG, or EXIF data with a focal length."""
+    with Image.open(folder / name) as picture:
+        picture.load()
+    exif = Image.Exif()
+    if says == b"focal":
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    picture.save(folder / name, exif=exif, comment=says, quality=95)
+
+
+def test_folders_that_are_not_all_panoramas_are_one_line(tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / "in"
+    save(folder / "a.jpg", RANDOM.random((32, 64, 3)))
+    save(folder / "b.jpg", RANDOM.random((40, 60, 3)))
+    line = r"in: 1 panorama \(a.jpg\) mixed with 1 other photo \(b.jpg\), expected one kind; move either elsewhere"
+    refuses(SceneError, line, run, folder, out)
+    whole = "b.jpg: an equirectangular photo of 60x40 pixels, expected twice as wide as high"
+    refuses(SceneError, whole, run, folder, out, camera_model="EQUIRECTANGULAR")
+    metadata(folder, "b.jpg", b'GPano:ProjectionType="equirectangular"')
+    refuses(SceneError, whole, run, folder, out)
+    save(folder / "b.jpg", RANDOM.random((64, 128, 3)))
+    refuses(
+        SceneError, r"panoramas of 64x32 pixels \(a.jpg\) and of 128x64 \(b.jpg\), expected one size", run, folder, out
+    )
+    save(folder / "b.jpg", RANDOM.random((32, 64, 3)))
+    refuses(UserInputError, "--camera-per one: panoramas need no", run, folder, out, camera_per="one")
+    refuses(SceneError, "none of the 2 panoramas could be placed", run, folder, out)
+    for name in ("a.jpg", "b.jpg"):
+        metadata(folder, name, b"focal")
+    refuses(UserInputError, "--tripod 9: .*in has no panoramas", run, folder, out, tripod=9)
 
 
 def below(camera: Camera, pose: Array) -> Array:
