@@ -1,4 +1,4 @@
-"""`lapgs prepare` of panoramas whose cameras are known. The tests stitch, look and project by formulas of their own."""
+"""`lapgs prepare` of panoramas and wide lenses. The tests stitch, look and project by formulas of their own."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -44,7 +45,12 @@ def rays_of(camera: Camera) -> Array:
 
 def waves(camera: Camera) -> Array:
     """Return smooth colours by direction."""
-    x, y, z = np.moveaxis(rays_of(camera), -1, 0)
+    return color_of(rays_of(camera))
+
+
+def color_of(rays: Array) -> Array:
+    """Return the colours of unit directions (h, w, 3)."""
+    x, y, z = np.moveaxis(rays, -1, 0)
     return 0.5 + 0.4 * np.stack([np.sin(7 * x) * np.cos(6 * z), np.cos(8 * y - 5 * x), np.sin(9 * z + 4 * y)], -1)
 
 
@@ -309,6 +315,84 @@ def test_folders_that_are_not_all_panoramas_are_one_line(tmp_path: Path) -> None
     for name in ("a.jpg", "b.jpg"):
         metadata(folder, name, b"focal")
     refuses(UserInputError, "--tripod 9: .*in has no panoramas", run, folder, out, tripod=9)
+
+
+Lens = tuple[str, tuple[int, int], list[float]]
+WIDE_LENSES: list[Lens] = [
+    ("OPENCV_FISHEYE", (240, 240), [75, 75, 120, 120, 0.01, 0.002, 0, 0]),  # 90 degrees to all sides
+    ("SIMPLE_FISHEYE", (240, 160), [70, 118, 81]),  # and more, of which COLMAP knows 90
+    ("OPENCV", (240, 180), [100, 102, 120, 92, -0.26, 0.06, 0.001, -0.002]),  # 119x94 degrees
+]
+
+
+def lens_rays(lens: Lens) -> tuple[Array, NDArray[np.bool_]]:
+    """Return unit directions of a lens's pixels, (h, w, 3), and which are less than 89 degrees from its axis."""
+    kind, (width, height), params = lens
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    if kind == "OPENCV":
+        matrix = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1.0]])
+        pixels = np.stack([columns.ravel(), rows.ravel()], 1)[:, None]
+        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 500, 1e-12)
+        plane = cv2.undistortPoints(pixels, matrix, np.array(params[4:]), criteria=stop)[:, 0]
+        rays = np.column_stack([plane, np.ones(len(plane))]).reshape(height, width, 3)
+        unit: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return unit, np.ones((height, width), bool)
+    focal, x, y, *terms = params if kind == "SIMPLE_FISHEYE" else params[1:]
+    polar = np.linspace(0, 2, 20001)
+    radii = focal * polar * (1 + sum(term * polar ** (2 * n) for n, term in enumerate(terms, 1)))
+    away = np.hypot(columns - x, rows - y)
+    angle, turn = np.interp(away, radii, polar), np.arctan2(rows - y, columns - x)
+    rays = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1)
+    return rays, angle < math.radians(89)
+
+
+def wide_scene(folder: Path, lens: Lens, poses: list[Array]) -> None:
+    """Write photos of a lens of the waves, and their COLMAP model."""
+    kind, size, params = lens
+    rays, _ = lens_rays(lens)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model=kind, width=size[0], height=size[1], params=params)
+    )
+    for number, pose in enumerate(poses, start=1):
+        save(folder / "images" / f"{number}.png", color_of(rays @ pose[:3, :3]))
+        image = pycolmap.Image(f"{number}.png", camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3]))
+    for point in RANDOM.standard_normal((9, 3)):
+        model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+    (folder / "sparse/0").mkdir(parents=True)
+    model.write_binary(folder / "sparse/0")
+
+
+@pytest.mark.parametrize("lens", WIDE_LENSES, ids=lambda lens: lens[0])
+def test_faces_of_a_wide_lens_show_what_it_sees(lens: Lens, tmp_path: Path) -> None:
+    poses = tilted()
+    wide_scene(tmp_path / "in", lens, poses)
+    run(tmp_path / "in", tmp_path / "out")
+    faces = [view for view in loaded(tmp_path / "out").train if view.name.startswith("1_")]
+    rays, known = lens_rays(lens)
+    directions = rays[known] @ poses[0][:3, :3]
+    seen = np.zeros(len(directions), bool)
+    for face in faces:
+        camera, mask = face.camera, face.mask
+        assert mask is not None
+        inside = mask[0].numpy()
+        difference = shown(face)[inside] - waves(camera)[inside]
+        assert np.sqrt((difference**2).mean()) < 0.003  # worst 0.0018, mostly of 8 bits
+        local = directions @ camera.world_to_camera[:3, :3].double().numpy().T
+        x, y = camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        on_it = (local[:, 2] > 0) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
+        row, column = (np.clip(at, 0, side - 1).astype(int) for at, side in ((y, camera.height), (x, camera.width)))
+        seen |= on_it & inside[row, column]
+    assert seen.mean() > 0.99  # borders of masks are those of pixels
+
+
+def test_lenses_that_see_less_are_one_image(tmp_path: Path) -> None:
+    wide_scene(tmp_path / "in", ("OPENCV_FISHEYE", (160, 120), [90, 90, 80, 60, 0.01, 0, 0, 0]), tilted())
+    run(tmp_path / "in", tmp_path / "out")
+    scene = loaded(tmp_path / "out")
+    assert [view.name for view in scene.train] == ["1.png", "2.png"]
+    assert not any(view.masked for view in scene.train)
 
 
 def below(camera: Camera, pose: Array) -> Array:

@@ -13,7 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.scenes.prepare.faces import DOWN, Face, focal_at_center, panorama_faces
+from lapgs_plugin.scenes.prepare.faces import (
+    DOWN,
+    Face,
+    focal_at_center,
+    focal_towards,
+    panorama_faces,
+    sees,
+    wide_faces,
+)
 from lapgs_plugin.scenes.prepare.photos import target_name
 from lapgs_plugin.scenes.source import ALL_AROUND
 
@@ -60,7 +68,7 @@ class Lens:
 def lenses_of(
     camera: pycolmap.Camera, photo: tuple[int, int], max_size: int | None, turns: int, tripod: float
 ) -> tuple[Lens, ...]:
-    """Return the lens of a camera, or those of its faces if it sees all around.
+    """Return the lens of a camera, or those of its faces if it sees all around or a wide part of it.
 
     Args:
         camera: of the model.
@@ -78,6 +86,8 @@ def lenses_of(
         pinholes = [face.camera(focal_at_center(resized.width)) for face in faces]
         return tuple(Lens(recovered, resized, pin, 0, face, tripod) for face, pin in zip(faces, pinholes, strict=True))
     resized = _resized(camera, photo, min(1.0, (max_size or math.inf) / max(photo)))
+    if wide := wide_faces(resized):
+        return tuple(Lens(recovered, resized, face.camera(focal_towards(resized, face)), 0, face) for face in wide)
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), resized)
     return (Lens(recovered, resized, pinhole, turns),)
 
@@ -101,10 +111,14 @@ def undistort(photo: Tensor, lens: Lens) -> Tensor:
 
 
 def inside(lens: Lens) -> Tensor:
-    """Return where the pinhole image does not show the tripod, (1, h', w') bool."""
+    """Return where a face shows what the photo does, and not the tripod, (1, h', w') bool."""
     rays = _rays(lens)
-    away = np.degrees(np.arccos(np.clip(rays @ DOWN / np.linalg.norm(rays, axis=1), -1.0, 1.0)))
-    return torch.from_numpy(away >= lens.tripod).reshape(1, lens.pinhole.height, lens.pinhole.width)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    if lens.resized.model.name == ALL_AROUND:
+        used = np.degrees(np.arccos(np.clip(rays @ DOWN, -1.0, 1.0))) >= lens.tripod
+    else:
+        used = sees(lens.resized, rays)
+    return torch.from_numpy(used).reshape(1, lens.pinhole.height, lens.pinhole.width)
 
 
 def _with_surroundings(photo: Tensor, lens: Lens) -> Tensor:
@@ -126,9 +140,9 @@ def _grid(lens: Lens) -> Tensor:
 
 def _make_grid(lens: Lens) -> Tensor:
     around = AROUND_PIXELS if lens.resized.model.name == ALL_AROUND else 0
-    source = np.asarray(lens.resized.img_from_cam(_rays(lens))) + around  # (h' w', 2)
+    source = np.asarray(lens.resized.img_from_cam(_rays(lens))) + around  # (h' w', 2), NaN behind a lens
     size = (lens.resized.width + 2 * around, lens.resized.height + 2 * around)
-    grid = torch.from_numpy(source / size * 2.0 - 1.0).float()
+    grid = torch.from_numpy(source / size * 2.0 - 1.0).float().nan_to_num(2.0).clamp(-2.0, 2.0)
     return grid.reshape(1, lens.pinhole.height, lens.pinhole.width, 2)
 
 
@@ -172,11 +186,11 @@ def cut_into_faces(model: pycolmap.Reconstruction, photos: Sequence[tuple[pycolm
         model: changed.
         photos: images of the model, each with the lenses of its faces.
     """
-    cameras: dict[tuple[int, tuple[float, float]], int] = {}
+    cameras: dict[tuple[float, ...], int] = {}
     for image, lenses in photos:
         for lens in lenses:
-            assert lens.face is not None
-            if (key := (image.camera_id, lens.face.angles)) not in cameras:
+            key = (image.camera_id, lens.pinhole.width, lens.pinhole.height, *lens.pinhole.params)
+            if key not in cameras:
                 cameras[key] = max(model.cameras) + 1
                 pinhole = pycolmap.Camera(lens.pinhole.todict())
                 pinhole.camera_id = cameras[key]

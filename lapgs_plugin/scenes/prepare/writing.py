@@ -25,6 +25,7 @@ from lapgs_plugin.scenes.prepare.undistort import (
     turn_pose,
     undistort,
 )
+from lapgs_plugin.scenes.source import ALL_AROUND
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +45,8 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}
     asked = (job.settings.max_size, turns, job.settings.tripod)
     lenses = {key: lenses_of(camera, sizes[key], *asked) for key, camera in model.cameras.items()}
-    masked = job.masks.is_dir() or job.settings.tripod > 0
+    cut = any(lens.face and lens.resized.model.name != ALL_AROUND for own in lenses.values() for lens in own)
+    masked = job.masks.is_dir() or job.settings.tripod > 0 or cut
     targets = [(lens.name_of(image.name), image.name) for image in images for lens in lenses[image.camera_id]]
     check_targets(job.source.folder, targets)
 
