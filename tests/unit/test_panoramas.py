@@ -14,6 +14,7 @@ import pytest
 import typer
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -311,7 +312,8 @@ def test_folders_that_are_not_all_panoramas_are_one_line(tmp_path: Path) -> None
     )
     save(folder / "b.jpg", RANDOM.random((32, 64, 3)))
     refuses(UserInputError, "--camera-per one: panoramas need no", run, folder, out, camera_per="one")
-    refuses(SceneError, "none of the 2 panoramas could be placed", run, folder, out)
+    apart = "none of the 2 panoramas could be placed; .*if they are ordinary photos, give --camera-model OPENCV"
+    refuses(SceneError, apart, run, folder, out)
     for name in ("a.jpg", "b.jpg"):
         metadata(folder, name, b"focal")
     refuses(UserInputError, "--tripod 9: .*in has no panoramas", run, folder, out, tripod=9)
@@ -385,6 +387,22 @@ def test_faces_of_a_wide_lens_show_what_it_sees(lens: Lens, tmp_path: Path) -> N
         row, column = (np.clip(at, 0, side - 1).astype(int) for at, side in ((y, camera.height), (x, camera.width)))
         seen |= on_it & inside[row, column]
     assert seen.mean() > 0.99  # borders of masks are those of pixels
+
+
+def test_colmap_places_photos_of_a_fisheye_lens(walked: Path, tmp_path: Path) -> None:
+    rays, known = lens_rays(("OPENCV_FISHEYE", (320, 320), [105, 105, 160, 160, 0, 0, 0, 0]))
+    for index in range(4):
+        with Image.open(walked / f"{index}.jpg") as image:
+            around = np.asarray(image, np.float64) / 255
+        x, y, z = np.moveaxis(rays, -1, 0)
+        rows = (np.arcsin(y) / math.pi + 0.5) * 256 - 0.5
+        columns = (np.arctan2(x, z) / (2 * math.pi) + 0.5) * 512 - 0.5
+        channels = [map_coordinates(around[..., c], [rows, columns], order=1, mode="grid-wrap") for c in range(3)]
+        save(tmp_path / "in" / f"{index}.jpg", np.stack(channels, -1) * known[..., None])
+    result = run(tmp_path / "in", tmp_path / "out", camera_model="OPENCV_FISHEYE")
+    assert result.registered == ("0.jpg", "1.jpg", "2.jpg", "3.jpg")
+    assert len(pycolmap.Reconstruction(tmp_path / "out/sparse/0").images) == 36
+    assert all(view.masked for view in loaded(tmp_path / "out").train)
 
 
 def test_lenses_that_see_less_are_one_image(tmp_path: Path) -> None:

@@ -98,7 +98,8 @@ def place_panoramas(job: Job, size: tuple[int, int]) -> tuple[pycolmap.Reconstru
     if not models or models[0].num_reg_frames() < 2:
         raise SceneError(
             f"{job.source.clip or job.source.folder}: none of the {len(job.names)} panoramas could be placed; expected "
-            "sharp panoramas of a static scene, each taken a step aside from the last"
+            "sharp panoramas of a static scene, each taken a step aside from the last; if they are ordinary photos, "
+            "give --camera-model OPENCV"
         )
     return _joined(models[0], camera, lenses, job.names), len(models)
 
@@ -134,8 +135,9 @@ def _cut(job: Job, lenses: Mapping[str, Lens]) -> Job:
 
         job.each_photo("Cutting panoramas", cut, job.names)
         partial.rename(work)
-    files = {file.relative_to(work / "photos").as_posix(): file for file in sorted((work / "photos").glob("*/**/*.*"))}
-    return Job(work, Photos(work / "photos", files), settings, job.progress)
+    photos = work / "photos"
+    files = {file.relative_to(photos).as_posix(): file for file in sorted(photos.rglob("*")) if file.is_file()}
+    return Job(work, Photos(photos, files), settings, job.progress)
 
 
 def _joined(

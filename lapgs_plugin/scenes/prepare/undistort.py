@@ -110,6 +110,7 @@ def undistort(photo: Tensor, lens: Lens) -> Tensor:
     return torch.rot90(straight, -lens.turns, (1, 2))
 
 
+@lru_cache(maxsize=64)
 def inside(lens: Lens) -> Tensor:
     """Return where a face shows what the photo does, and not the tripod, (1, h', w') bool."""
     rays = _rays(lens)

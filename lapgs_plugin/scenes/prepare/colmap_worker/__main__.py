@@ -20,6 +20,8 @@ import pycolmap
 
 SEED = 0
 """Seed of COLMAP's random choices, and of those of features for a vocabulary."""
+FISHEYE_FOCAL = 0.4
+"""Focal length of a fisheye lens in longer sides of the photo, to start from: 143 degrees across."""
 
 MOST_DESCRIPTORS = 65_536
 """Most features that a vocabulary is made of."""
@@ -56,6 +58,9 @@ def find_features(job: dict[str, Any]) -> None:
     """
     mode = pycolmap.CameraMode.__members__[job["camera_mode"]]
     reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
+    fisheye = "FISHEYE" in job["camera_model"]
+    if fisheye:
+        reader.default_focal_length_factor = FISHEYE_FOCAL
     if job["masks"] is not None:
         reader.mask_path = job["masks"]
     options = pycolmap.FeatureExtractionOptions(use_gpu=pycolmap.has_cuda)
@@ -70,6 +75,11 @@ def find_features(job: dict[str, Any]) -> None:
             Path(job["database"] + suffix).unlink(missing_ok=True)
         pycolmap.Database.open(job["database"]).close()
         pycolmap.import_images(job["database"], job["photos"], mode, job["names"], reader)
+        if fisheye:  # lines are so bent that no pair has a geometry without calibration
+            with pycolmap.Database.open(job["database"]) as database:
+                for camera in database.read_all_cameras():
+                    camera.has_prior_focal_length = True
+                    database.update_camera(camera)
     pycolmap.extract_features(job["database"], job["photos"], job["names"], mode, reader, options)
     if job["rig"]:
         with pycolmap.Database.open(job["database"]) as database:
