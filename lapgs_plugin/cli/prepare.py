@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -53,18 +52,19 @@ def prepare(
         f"{out}: {len(result.registered)} of {total} photos, {counted(result.points, 'point')}, {error}"
         + ", ".join(f"{step[0].lower()}{step[1:]} {seconds:.0f} s" for step, seconds in result.seconds.items())
     )
-    say(f"next: {next_command(out, result.registered)}")
+    say(f"next: {next_command(out)}")
 
 
-def next_command(out: Path, registered: Sequence[str]) -> str:
+def next_command(out: Path) -> str:
     """Return the command that trains the scene. It has options for minutes where a CPU would take hours."""
+    from lapgs_plugin.files import is_file
     from lapgs_plugin.scenes.images import image_size
-    from lapgs_plugin.scenes.prepare.photos import target_name
     from lapgs_plugin.training.backend import MINUTES_ON_A_CPU, choose_rasterizer, long_on_a_cpu
     from lapgs_plugin.training.settings import TrainSettings
 
-    iterations = TrainSettings().for_photos(len(registered)).iterations
-    size = image_size(out / "images" / target_name(registered[0]))
+    images = sorted(filter(is_file, (out / "images").rglob("*")))
+    iterations = TrainSettings().for_photos(len(images)).iterations
+    size = image_size(images[0])
     if long_on_a_cpu(size, iterations):
         with suppress(MissingExtraError):  # of a machine with a GPU
             if choose_rasterizer(AUTO) == "cpu":

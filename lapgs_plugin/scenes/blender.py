@@ -308,6 +308,9 @@ def _read_frames(
             raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path, lens[0])}")
         if not ("w" in posed and "h" in posed):
             posed["w"], posed["h"] = image_size(image)
+        if lens[0] == ALL_AROUND:  # programs write focal lengths of several meanings
+            across, down = posed["w"], posed["h"]
+            posed |= {"fl_x": across, "fl_y": across, "cx": across / 2, "cy": down / 2}
         camera = read_camera(posed, where)
         check_camera(f"{file}: the camera of {name}", camera)
         frames.append(Frame(name, image, camera))

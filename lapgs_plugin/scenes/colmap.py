@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -22,6 +23,7 @@ from lapgs_plugin.scenes.images import find_image, where_else
 from lapgs_plugin.scenes.point_cloud import read_point_cloud
 from lapgs_plugin.scenes.random_points import random_points
 from lapgs_plugin.scenes.source import (
+    ALL_AROUND,
     PINHOLE_MODELS,
     Frame,
     SceneSource,
@@ -119,7 +121,7 @@ def source_of(model: Model, folder: Path) -> SceneSource:
     A model without points gets random ones.
 
     Args:
-        model: its cameras are perspective or fisheye.
+        model: its cameras are perspective, fisheye or equirectangular.
         folder: of the images, of which some may be missing.
 
     Raises:
@@ -195,7 +197,10 @@ def _distortion(camera: pycolmap.Camera) -> str:
 
 
 def _intrinsics(camera: pycolmap.Camera) -> Camera:
-    """Return the camera without distortion and pose."""
+    """Return the camera without distortion and pose; of one that sees all around that of its faces."""
+    if camera.model.name == ALL_AROUND:
+        focal, (width, height) = camera.width / (2.0 * math.pi), (camera.width, camera.height)
+        return Camera(width, height, focal, focal, width / 2.0, height / 2.0, torch.eye(4, dtype=torch.float64))
     matrix = camera.calibration_matrix()  # (3, 3)
     return Camera(
         width=camera.width,

@@ -20,7 +20,7 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 """Camera models that are pinhole cameras if their distortion parameters are zero; fisheye models never are."""
 
 ALL_AROUND = "EQUIRECTANGULAR"
-ALL_AROUND_HINT = "it sees all around, which no pinhole image shows; cut its photos into several first"
+"""COLMAP's camera model of panoramas, which see all around."""
 
 LARGEST = 1e12
 """Largest coordinate in world units. Training in float32 multiplies squares of coordinates."""
@@ -70,7 +70,7 @@ class SceneSource:
 def undistort_hint(scene: Path, model: str) -> str:
     """Return advice about a scene's distorted cameras of this camera model."""
     if model == ALL_AROUND:
-        return ALL_AROUND_HINT
+        return f"it sees all around; cut its photos into pinhole images with `lapgs prepare {quote(str(scene))} OUT`"
     return f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`"
 
 

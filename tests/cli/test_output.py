@@ -70,8 +70,9 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
     monkeypatch.setattr(backend, "choose_rasterizer", choose)
     monkeypatch.chdir(tmp_path)
     Path("desk/images/left").mkdir(parents=True)
-    Image.new("L", size).save("desk/images/left/a.png")
-    command = prepare.next_command(Path("desk"), ["left/a.webp", *(f"left/{i}.webp" for i in range(24))])
+    for index in range(25):
+        Image.new("L", size).save(f"desk/images/left/{index}.png")
+    command = prepare.next_command(Path("desk"))
     assert command == f"lapgs train desk -o runs/desk --eval{options}"
 
 

@@ -370,7 +370,7 @@ def test_a_transforms_file_gives_the_images_and_poses_of_the_model(tmp_path: Pat
             {"distortion_params": [0.1]},
             r"distortion_params = \[0.1\]\) cannot be undistorted; expected numbers k1, k2, p1, p2, k3",
         ),
-        ({"camera_model": "EQUIRECTANGULAR"}, r"camera is EQUIRECTANGULAR: it sees all around"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"an equirectangular photo of .* expected twice as wide as high"),
         ({"k1": "much"}, r"k1 = much.* cannot be undistorted"),
         ({"k1": float("nan")}, r"camera \d \(FULL_OPENCV\) has NaN or inf"),
         ({"w": 191, "h": 140}, r"a\.jpg: the image is 192x128 pixels, its camera 191x140"),
@@ -392,7 +392,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path) -> None:
         assert not out.exists()
 
     refused(UserInputError, "--matcher: .*sparse/0 has the cameras already; leave", matcher="sequential")
-    refused(UserInputError, "--own-cameras|--single-camera: .* has the cameras already", single_camera=False)
+    refused(UserInputError, "--camera-per: .* has the cameras already", camera_per="one")
     refused(UserInputError, "--model .*empty: no model of COLMAP in it", model=tmp_path / "empty")
     refused(
         SceneError,
@@ -420,7 +420,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path) -> None:
     around = pycolmap.Camera.create_from_model_name(9, "EQUIRECTANGULAR", 1.0, 192, 128)
     model.cameras[1].model, model.cameras[1].params = around.model, around.params
     model.write_binary(scene / "sparse" / "0")
-    refused(SceneError, r"camera 1 \(EQUIRECTANGULAR\): it sees all around")
+    refused(SceneError, r"camera 1 \(EQUIRECTANGULAR\): .* expected twice as wide as high")
 
 
 def test_exr_keeps_its_range(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from lapgs_plugin.scenes.prepare import photos as photos_module
 from lapgs_plugin.scenes.prepare.clip import judge, pick_frames, sharp_and_moving, write_frames
 from lapgs_plugin.scenes.prepare.colmap import HAS_GLOBAL, chosen_matcher
 from lapgs_plugin.scenes.prepare.colmap_worker import __main__ as colmap_worker
-from lapgs_plugin.scenes.prepare.inputs import one_camera
+from lapgs_plugin.scenes.prepare.inputs import camera_mode
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
 from lapgs_plugin.scenes.prepare.photos import Photos, find_photos
@@ -407,10 +407,16 @@ def test_photos_of_several_cameras_get_cameras_of_their_own(
     job = Job(tmp_path, find_photos(noise), PrepareSettings(), False)
     sizes = dict.fromkeys(job.names, (80, 64))
     with caplog.at_level(logging.INFO):
-        assert one_camera(job, sizes) is False
+        assert camera_mode(job, sizes) == "AUTO"
     assert "photos of 2 cameras or sizes: 2 of 80x64 One; 1 of 80x64 Two" in caplog.text
-    assert one_camera(replace(job, settings=PrepareSettings(single_camera=True)), sizes) is True
-    assert one_camera(job, dict.fromkeys(("0.jpg", "1.jpg"), (80, 64))) is True
+    for asked, mode in (("one", "SINGLE"), ("folder", "PER_FOLDER"), ("image", "PER_IMAGE")):
+        assert camera_mode(replace(job, settings=PrepareSettings(camera_per=asked)), sizes) == mode
+    assert camera_mode(job, dict.fromkeys(("0.jpg", "1.jpg"), (80, 64))) == "SINGLE"
+    mixed, per_folder = {"a/0.jpg": (80, 64), "a/1.jpg": (60, 40)}, PrepareSettings(camera_per="folder")
+    line = "--camera-per folder: .*a/0.jpg has 80x64 pixels and .*a/1.jpg 60x40, expected one size"
+    refuses(UserInputError, line, camera_mode, replace(job, settings=per_folder), mixed)
+    apart = {"a/0.jpg": (80, 64), "b/1.jpg": (60, 40)}
+    assert camera_mode(replace(job, settings=per_folder), apart) == "PER_FOLDER"
 
 
 def test_masks_that_do_not_fit_photos_are_one_line(noise: Path, tmp_path: Path) -> None:

@@ -286,7 +286,7 @@ def test_few_features_are_mapped_by_one_thread(
     monkeypatch.setattr(pycolmap.Database, "open", lambda path: nullcontext(database))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *args, **callbacks: used.append(args[3].num_threads))
     job = {"database": "", "photos": "", "models": "", "placed": str(tmp_path / "placed"), "mapper": "incremental"}
-    colmap_worker.map_photos(job)
+    colmap_worker.map_photos({**job, "rig": False})
     assert used == [threads]
 
 
@@ -364,7 +364,7 @@ def test_what_cannot_be_photos_is_named(noise: Path, tmp_path: Path) -> None:
     refused(UserInputError, "--camera-model 'LENS': expected auto or one of SIMPLE_PINHOLE", camera_model="LENS")
     refused(UserInputError, "--max-size 10: expected at least 64", max_size=10)
     _save(noise / "larger.png", np.zeros((90, 90, 3), np.float32))
-    refused(UserInputError, r"--single-camera: .*80x64 pixels and .*90x90", single_camera=True)
+    refused(UserInputError, r"--camera-per one: .*80x64 pixels and .*90x90", camera_per="one")
     (noise / "half.png").write_bytes((noise / "00.png").read_bytes()[:3000])
     refused(SceneError, r"half\.png: .*damaged or cut short")
     (noise / "half.png").write_text("no image")
@@ -411,12 +411,24 @@ def test_a_failure_of_colmap_is_one_line(
 
 def test_the_worker_ends_with_the_process_that_started_it(photos: Path, tmp_path: Path) -> None:
     job = {"step": "features", "database": str(tmp_path / "database.db"), "photos": str(photos), "max_size": None}
-    job |= {"masks": None}
-    job |= {"names": [file.name for file in photos.iterdir()], "camera_model": "OPENCV", "single_camera": True}
+    job |= {"masks": None, "camera_model": "OPENCV", "camera_mode": "SINGLE", "rig": []}
+    job |= {"names": [file.name for file in photos.iterdir()]}
     command = [sys.executable, str(colmap.WORKER)]
     worker = subprocess.run(command, input=json.dumps(job).encode() + b"\n", capture_output=True, check=False)
     assert worker.returncode == 1
     assert b"Traceback" not in worker.stderr
+
+
+def test_each_folder_has_a_camera(photos: Path, tmp_path: Path) -> None:
+    for index in range(6):
+        target = tmp_path / "in" / ("left", "right")[index % 2] / f"{index}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photos / f"{index:02d}.png", target)
+    settings = PrepareSettings(camera_per="folder", camera_model="SIMPLE_PINHOLE")
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings, progress=False)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    assert len(model.cameras) == 2
+    assert len({(Path(image.name).parent, image.camera_id) for image in model.images.values()}) == 2
 
 
 def test_command_line_replaces_a_scene_by_smaller_images_of_the_same_view(

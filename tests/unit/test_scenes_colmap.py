@@ -340,9 +340,9 @@ def test_distorted_camera_names_prepare(tmp_path: Path, camera: str, message: st
     refused(path, message + ".*`lapgs prepare")
 
 
-def test_photos_that_see_all_around_cannot_be_undistorted(tmp_path: Path) -> None:
+def test_photos_that_see_all_around_are_to_be_cut(tmp_path: Path) -> None:
     path = make_scene(tmp_path, Model(cameras={1: "EQUIRECTANGULAR 96 64 96 64"}))
-    assert "lapgs prepare" not in refused(path, "sees all around")
+    assert "cut its photos into pinhole images with `lapgs prepare" in refused(path, "sees all around")
 
 
 def test_cameras_of_every_model_of_colmap_are_whole(tmp_path: Path) -> None:

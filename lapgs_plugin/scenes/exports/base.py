@@ -21,7 +21,7 @@ from lapgs_plugin.scenes.exports.fourth_term import rational_terms
 from lapgs_plugin.scenes.images import find_image, image_size, is_photo
 from lapgs_plugin.scenes.masks import has_photo_suffix
 from lapgs_plugin.scenes.point_cloud import PointCloud
-from lapgs_plugin.scenes.source import ALL_AROUND_HINT, LARGEST
+from lapgs_plugin.scenes.source import LARGEST
 from lapgs_plugin.untrusted import shortened
 
 Array = NDArray[np.float64]
@@ -265,9 +265,7 @@ def lens(model: str, size: tuple[int, int], params: Sequence[float]) -> pycolmap
 
 
 def unknown_lens(where: str, kind: object, known: Sequence[str]) -> SceneError:
-    """Return the error for a lens model that is not known here, or sees all around."""
-    if kind in ALL_AROUND_LENSES:
-        return SceneError(f"{where} has the lens model {kind}: {ALL_AROUND_HINT}")
+    """Return the error for a lens model that is not known here."""
     return SceneError(
         f"{where} has the lens model {shortened(kind)}, expected {', '.join(known)}; undistort the photos in the "
         "program that wrote it, and export these with their pinhole cameras"

@@ -15,6 +15,7 @@ import pycolmap
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.exports.base import (
+    ALL_AROUND_LENSES,
     EXPORT_AGAIN,
     INEXACT,
     Array,
@@ -33,6 +34,7 @@ from lapgs_plugin.scenes.exports.base import (
     unknown_lens,
 )
 from lapgs_plugin.scenes.exports.points import SEEN, points_beside, seen_share
+from lapgs_plugin.scenes.panorama import panorama_lens
 from lapgs_plugin.untrusted import read_xml, shortened
 
 if TYPE_CHECKING:
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
     from lapgs_plugin.scenes.point_cloud import PointCloud
 
-LENSES = ("frame", "fisheye")
+LENSES = ("frame", "fisheye", "spherical")
 FAR = 1e4
 """Distance from the origin, in extents of the cameras, of coordinates of the earth."""
 
@@ -163,16 +165,18 @@ def _in_fitting_world(
 
 
 def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
-    """Return a sensor's adjusted lens, else its initial one; None if it is not calibrated."""
+    """Return a sensor's adjusted lens, else its initial one; None if it is not calibrated. Spherical ones are exact."""
+    where = f"{source}: sensor {shortened(sensor.get('label', ''))}"
+    if sensor.get("type") in ALL_AROUND_LENSES:
+        return panorama_lens(_size(sensor, where), where)
     known = sensor.findall("calibration")
     calibration = next((one for one in known if one.get("class") == "adjusted"), known[-1] if known else None)
     if calibration is None:
         return None
-    where = f"{source}: sensor {shortened(sensor.get('label', ''))}"
-    resolution = calibration.find("resolution")
-    sides = {} if resolution is None else resolution.attrib
-    width, height = size_of(sides.get("width"), sides.get("height"), where)
+    width, height = _size(calibration, where)
     kind = calibration.get("type", "frame")
+    if kind in ALL_AROUND_LENSES:
+        return panorama_lens((width, height), where)
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)
 
@@ -188,3 +192,10 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
     if kind == "frame":
         return perspective((width, height), focal, center, radial, (p2, p1), where=where)
     return lens("THIN_PRISM_FISHEYE", (width, height), [*focal, *center, *radial[:2], p2, p1, *radial[2:], 0.0, 0.0])
+
+
+def _size(parent: Element, where: str) -> tuple[int, int]:
+    """Return width and height in an element `resolution`."""
+    resolution = parent.find("resolution")
+    sides = {} if resolution is None else resolution.attrib
+    return size_of(sides.get("width"), sides.get("height"), where)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes.exports.base import (
+    ALL_AROUND_LENSES,
     EXPORT_AGAIN,
     Array,
     Export,
@@ -31,6 +32,7 @@ from lapgs_plugin.scenes.exports.base import (
     skipped,
     unknown_lens,
 )
+from lapgs_plugin.scenes.panorama import panorama_lens
 from lapgs_plugin.scenes.point_cloud import PointCloud
 from lapgs_plugin.untrusted import read_json, shortened
 
@@ -41,7 +43,7 @@ FILES = (
     "shots.geojson",
 )
 """Where cameras are, in the order in which they are looked for."""
-LENSES = ("perspective", "simple_radial", "radial", "brown", "fisheye", "fisheye_opencv")
+LENSES = ("perspective", "simple_radial", "radial", "brown", "fisheye", "fisheye_opencv", "spherical")
 
 Values = Mapping[str, Any]
 
@@ -144,6 +146,8 @@ def _lens(where: str, camera: Any) -> pycolmap.Camera:
     values = camera if isinstance(camera, dict) else {}
     kind = values.get("projection_type")
     width, height = size_of(values.get("width"), values.get("height"), where)
+    if kind in ALL_AROUND_LENSES:
+        return panorama_lens((width, height), where)
     if kind not in LENSES:
         raise unknown_lens(where, kind, LENSES)
 

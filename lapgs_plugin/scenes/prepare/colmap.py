@@ -70,14 +70,21 @@ def chosen_matcher(job: Job) -> str:
     return RETRIEVAL if len(job.names) > MOST_EXHAUSTIVE and HAS_VOCABULARY else EXHAUSTIVE
 
 
-def find_features(job: Job, single_camera: bool) -> None:
-    """Find the features of all photos, and give them one camera if `single_camera`."""
+def find_features(job: Job, camera_mode: str, rig: Sequence[dict[str, Any]] = ()) -> None:
+    """Find the features of all photos.
+
+    Args:
+        job: of the photos.
+        camera_mode: COLMAP's name for which of them share a camera.
+        rig: cameras of a rig by folder, as `colmap_worker` takes them; none without a rig.
+    """
     asked = job.settings.camera_model
     options = {
         "photos": str(job.photos.absolute()),
         "names": job.names,
         "camera_model": DEFAULT_MODEL if asked == AUTO else asked,
-        "single_camera": single_camera,
+        "camera_mode": camera_mode,
+        "rig": rig,
         "max_size": job.settings.max_size,
         "masks": str(job.masks.absolute()) if job.masks.is_dir() else None,
     }
@@ -85,8 +92,8 @@ def find_features(job: Job, single_camera: bool) -> None:
     _run_step(job, "features", options, [phase])
 
 
-def match_pairs(job: Job) -> None:
-    """Match the features of those pairs of photos that the matcher chooses."""
+def match_pairs(job: Job, rig: bool = False) -> None:
+    """Match the features of those pairs of photos that the matcher chooses; of a `rig` those of different frames."""
     count, loops, matcher = len(job.names), _loops(job), chosen_matcher(job)
     total = {
         EXHAUSTIVE: count * (count - 1) // 2,
@@ -97,7 +104,7 @@ def match_pairs(job: Job) -> None:
     if matcher == RETRIEVAL or (matcher == SEQUENTIAL and loops):
         indexed = re.compile(rb"Indexing image \[(\d+)/")
         phases.insert(0, Phase("Comparing photos", "photos", count, lambda: _logged(job, indexed)))
-    _run_step(job, "pairs", _pairing(job), phases)
+    _run_step(job, "pairs", {**_pairing(job), "rig": rig}, phases)
 
 
 def match_more(job: Job) -> Path | None:
@@ -167,6 +174,7 @@ class Attempt:
         folder: name of the folder of its models.
         lens: camera model to fit; None for the database's.
         mapper, database: to use instead of the job's.
+        rig: whether lenses and the rig of the photos are known.
     """
 
     title: str
@@ -174,6 +182,7 @@ class Attempt:
     lens: str | None = None
     mapper: str | None = None
     database: Path | None = None
+    rig: bool = False
 
 
 def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
@@ -189,6 +198,7 @@ def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
             "models": str(unfinished),
             "placed": str(placed),
             "mapper": attempt.mapper or job.settings.mapper,
+            "rig": attempt.rig,
         }
         if attempt.lens is not None:
             other = job.work / "simple.db"

@@ -1,4 +1,4 @@
-"""Make the photos and masks that COLMAP reads, and find out whether one camera took them."""
+"""Make the photos and masks that COLMAP reads, and find out which of them a camera took."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import camera_of, convert_photo, listed
+from lapgs_plugin.scenes.prepare.settings import AUTO, FOLDER, IMAGE, ONE, PER_FOLDER, PER_GROUP, PER_IMAGE, SINGLE
 
 logger = logging.getLogger(__name__)
 
@@ -113,21 +114,28 @@ def read_sizes(job: Job, decode: bool = True) -> dict[str, tuple[int, int]]:
     ) from first
 
 
-def one_camera(job: Job, sizes: dict[str, tuple[int, int]]) -> bool:
-    """Return whether all photos share a camera."""
-    names, asked = {size: name for name, size in sizes.items()}, job.settings.single_camera
-    if asked and len(names) > 1:
-        (first, one), (second, other) = list(names.items())[:2]
-        raise UserInputError(
-            f"--single-camera: {job.photos / one} has {first[0]}x{first[1]} pixels and {job.photos / other} "
-            f"{second[0]}x{second[1]}, expected one size; leave the option out"
-        )
-    if asked is not None:
-        return asked
+def camera_mode(job: Job, sizes: dict[str, tuple[int, int]]) -> str:
+    """Return COLMAP's name for which photos share a camera.
+
+    Raises:
+        UserInputError: photos that are said to share one differ in size.
+    """
+    asked = job.settings.camera_per
+    if asked in (ONE, FOLDER):
+        shared: dict[Path, str] = {}
+        for name, size in sizes.items():
+            other = shared.setdefault(Path(name).parent if asked == FOLDER else Path(), name)
+            if size != sizes[other]:
+                raise UserInputError(
+                    f"--camera-per {asked}: {job.photos / other} has {sizes[other][0]}x{sizes[other][1]} pixels and "
+                    f"{job.photos / name} {size[0]}x{size[1]}, expected one size; leave the option out"
+                )
+    if asked != AUTO:
+        return {ONE: SINGLE, FOLDER: PER_FOLDER, IMAGE: PER_IMAGE}[asked]
     cameras = Counter((*size, *camera_of(job.photos / name)) for name, size in sizes.items())
     if len(cameras) > 1:
         logger.info("photos of %d cameras or sizes: %s", len(cameras), "; ".join(map(_camera_words, cameras.items())))
-    return len(cameras) == 1
+    return SINGLE if len(cameras) == 1 else PER_GROUP
 
 
 def _camera_words(counted: tuple[tuple[Any, ...], int]) -> str:

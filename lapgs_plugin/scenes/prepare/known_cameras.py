@@ -31,14 +31,15 @@ from lapgs_plugin.scenes.colmap_records import NO_TRACK, Points
 from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.images import image_size
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_masks
+from lapgs_plugin.scenes.panorama import panorama_lens
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.scene import check_shape, check_source
-from lapgs_plugin.scenes.source import ALL_AROUND, ALL_AROUND_HINT, PINHOLE_MODELS, Frame, SceneSource
+from lapgs_plugin.scenes.source import ALL_AROUND, PINHOLE_MODELS, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
 """Folders in which the photos of a model may be."""
-USED = ("max_size", "masks", "model")
+USED = ("max_size", "masks", "tripod", "model")
 """Settings that concern undistortion."""
 STRAIGHT = {"PINHOLE", "SIMPLE_PINHOLE"}
 """Camera models without distortion."""
@@ -148,6 +149,11 @@ def read_known_cameras(cameras: Path, photos: Path, settings: PrepareSettings) -
             f"{cameras}: its cameras have no distortion, so that its photos can be trained on as they are; to find the "
             "cameras again, give a folder of photos without a model"
         )
+    kinds = {camera.model.name for camera in model.cameras.values()}
+    if settings.tripod and ALL_AROUND not in kinds:
+        raise UserInputError(
+            f"--tripod {settings.tripod:g}: {cameras} has no panoramas, of which it hides what is below; leave it out"
+        )
     check_source(photos, replace(source, train=present))
     check_targets(photos, [(frame.name, frame.name) for frame in present])
     for warning in source.warnings:
@@ -225,7 +231,7 @@ def _check_lenses(model: Model) -> None:
         camera = model.cameras[key]
         subject = f"{model.folder}: camera {key} ({camera.model.name})"
         if camera.model.name == ALL_AROUND:
-            raise SceneError(f"{subject}: {ALL_AROUND_HINT}")
+            panorama_lens((camera.width, camera.height), subject)
         if not np.isfinite(camera.params).all():
             raise SceneError(f"{subject} has NaN or inf in its parameters; reconstruct or export it again")
 
@@ -260,8 +266,10 @@ def _reconstruction(model: Model, names: Collection[str]) -> pycolmap.Reconstruc
 
 def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> pycolmap.Camera:
     """Return COLMAP's camera for a lens of a transforms file and its distortion."""
-    model, terms = _colmap_distortion(frame, kind, distortion)
     camera = frame.camera
+    if kind == ALL_AROUND:
+        return panorama_lens(camera.size, str(frame.path))
+    model, terms = _colmap_distortion(frame, kind, distortion)
     params = [camera.fx, camera.fy, camera.cx, camera.cy, *terms]
     return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
 
@@ -270,8 +278,6 @@ def _colmap_distortion(frame: Frame, kind: str, distortion: Mapping[str, object]
     """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
     if kind in PINHOLE_MODELS and not distortion:
         return "PINHOLE", []
-    if kind == ALL_AROUND:
-        raise SceneError(f"{frame.path}: its camera is {kind}: {ALL_AROUND_HINT}")
     model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
     values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
     if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):

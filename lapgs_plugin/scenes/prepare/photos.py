@@ -18,6 +18,8 @@ from lapgs_plugin.scenes.masks import HEIC, has_photo_suffix
 
 SHOWN = 10
 """File names in a message, at most."""
+HEADER_BYTES = 1 << 17
+"""Beginning of a photo in which its metadata are."""
 CONVERTED = (*HEIC, ".webp")
 """Photos that pycolmap does not read."""
 
@@ -156,6 +158,13 @@ def camera_of(photo: Path) -> tuple[str, ...]:
         values += [inner.get(tag) for tag in (tags.FocalLength, tags.FocalLengthIn35mmFilm)]
         return tuple("" if value is None else str(value).strip("\0 ") for value in values)
     return ("",) * 4
+
+
+def says_all_around(photo: Path) -> bool:
+    """Return whether a photo says in its XMP data (GPano) that it is equirectangular."""
+    with suppress(OSError), photo.open("rb") as stream:  # reading the photo will fail with a message
+        return b"equirectangular" in (start := stream.read(HEADER_BYTES)) and b"ProjectionType" in start
+    return False
 
 
 def quarter_turns(photo: Path) -> int | None:

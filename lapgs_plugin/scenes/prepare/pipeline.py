@@ -15,10 +15,11 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.options import option_values
 from lapgs_plugin.scenes.output import check_output, writing_explained
 from lapgs_plugin.scenes.prepare.colmap import chosen_matcher, find_features, match_pairs, require_colmap_for
-from lapgs_plugin.scenes.prepare.inputs import make_masks, make_photos, one_camera, read_sizes
+from lapgs_plugin.scenes.prepare.inputs import camera_mode, make_masks, make_photos, read_sizes
 from lapgs_plugin.scenes.prepare.job import WORK, Job, opened_work
 from lapgs_plugin.scenes.prepare.known_cameras import KnownCameras, find_known_cameras, read_known_cameras
 from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
+from lapgs_plugin.scenes.prepare.panoramas import are_panoramas, place_panoramas
 from lapgs_plugin.scenes.prepare.photos import Photos, find_photos, listed
 from lapgs_plugin.scenes.prepare.placement import place_cameras
 from lapgs_plugin.scenes.prepare.settings import SEQUENTIAL, PrepareSettings
@@ -93,13 +94,19 @@ def prepare_scene(
         job = Job(out / WORK, source, settings, progress)
         with opened_work(job.work, _identity(source, settings), overwrite):
             make_photos(job)
-            single_camera = one_camera(job, read_sizes(job))
+            sizes = read_sizes(job)
+            panoramas = are_panoramas(job, sizes)
+            mode = camera_mode(job, sizes)
             make_masks(job)
-        find_features(job, single_camera)
-        match_pairs(job)
-        models = place_cameras(job)
-        result = _describe(job, models)
-        write_scene(job, models[0])
+        if panoramas:
+            model, parts = place_panoramas(job, sizes[job.names[0]])
+            result = _describe_panoramas(job, model, parts)
+        else:
+            find_features(job, mode)
+            match_pairs(job)
+            models = place_cameras(job)
+            model, result = models[0], _describe(job, models)
+        write_scene(job, model)
         move_into_place(job.work, out)
     return result
 
@@ -143,6 +150,19 @@ def _identity(source: Photos, settings: PrepareSettings) -> dict[str, Any]:
     }
 
 
+def _describe_panoramas(job: Job, model: pycolmap.Reconstruction, parts: int) -> PrepareResult:
+    registered = sorted(image.name for image in model.images.values())
+    left_out = sorted(set(job.names) - set(registered))
+    if left_out:
+        logger.warning(
+            "%d of %d panoramas could not be placed: %s; take more in between, each a step aside from the last",
+            len(left_out),
+            len(job.names),
+            listed(left_out),
+        )
+    return _result(job, model, registered, left_out, parts)
+
+
 def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareResult:
     best = models[0]
     registered = sorted(image.name for image in best.images.values() if image.has_pose)
@@ -153,13 +173,19 @@ def _describe(job: Job, models: Sequence[pycolmap.Reconstruction]) -> PrepareRes
             logger.warning("%s: %s", listed(names), reason)
         if chosen_matcher(job) == SEQUENTIAL and job.source.clip is None:
             logger.warning("--matcher sequential compares neighbours by name; try --matcher exhaustive")
-    if warning := few_points(best.num_points3D(), len(registered)):
+    return _result(job, best, registered, left_out, len(models))
+
+
+def _result(
+    job: Job, model: pycolmap.Reconstruction, registered: Sequence[str], left_out: Sequence[str], parts: int
+) -> PrepareResult:
+    if warning := few_points(model.num_points3D(), len(registered)):
         logger.warning(warning)
     return PrepareResult(
         registered=tuple(registered),
         left_out=tuple(left_out),
-        parts=len(models),
-        points=best.num_points3D(),
-        reprojection_error=best.compute_mean_reprojection_error(),
+        parts=parts,
+        points=model.num_points3D(),
+        reprojection_error=model.compute_mean_reprojection_error(),
         seconds=job.seconds,
     )

@@ -10,10 +10,13 @@ from lapgs_plugin.options import check_values, option
 
 AUTO = "auto"
 EXHAUSTIVE, SEQUENTIAL, RETRIEVAL = "exhaustive", "sequential", "retrieval"
+ONE, FOLDER, IMAGE = "one", "folder", "image"
+PER_GROUP, SINGLE, PER_FOLDER, PER_IMAGE = "AUTO", "SINGLE", "PER_FOLDER", "PER_IMAGE"
+"""COLMAP's names for photos that share a camera: those of a group by EXIF, all, those of a folder, none."""
 INCREMENTAL, GLOBAL = "incremental", "global"
 CAMERA_MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"),
 )
 MIN_SIDE = 64  # features need room
 
@@ -37,10 +40,18 @@ class PrepareSettings:
         "Folder of masks: white where a photo shows the scene, black where it is ignored (a.jpg.png, a.png or "
         "a_mask.png for a.jpg). Default: transparent pixels of the photos, if there are any.",
     )
+    tripod: float = option(
+        0.0,
+        "Ignore what panoramas show within this many degrees of straight down, such as a tripod: 30. Default: 0, "
+        "ignore nothing.",
+        least=0.0,
+        most=90.0,
+    )
     camera_model: str = option(
         AUTO,
-        "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens). auto: "
-        "OPENCV, and SIMPLE_RADIAL if the result is doubtful.",
+        "COLMAP's camera model to fit, such as SIMPLE_RADIAL (few photos) or OPENCV_FISHEYE (fisheye lens), or "
+        "EQUIRECTANGULAR for panoramas. auto: EQUIRECTANGULAR for photos twice as wide as high without a focal length, "
+        "else OPENCV, and SIMPLE_RADIAL if the result is doubtful.",
     )
     matcher: str = option(
         AUTO,
@@ -54,11 +65,11 @@ class PrepareSettings:
         "How cameras are placed. incremental: one after the other. global: all at once.",
         choices=(INCREMENTAL, GLOBAL),
     )
-    single_camera: bool | None = option(
-        None,
-        "Fit one camera to all photos, or one to each group of photos with the same EXIF data. Default: one camera if "
-        "all photos have the same size and camera.",
-        names=("--single-camera/--own-cameras",),
+    camera_per: str = option(
+        AUTO,
+        "Photos that share a lens. one: all. folder: those of a subfolder, for several cameras. image: each has its "
+        "own. auto: those of the same size, maker and focal lengths by EXIF.",
+        choices=(AUTO, ONE, FOLDER, IMAGE),
     )
     model: Path | None = option(
         None,

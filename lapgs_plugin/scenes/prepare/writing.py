@@ -1,20 +1,31 @@
-"""Write the scene: undistorted photos and masks with a PINHOLE model, moved into place when they are whole."""
+"""Write the scene: undistorted photos, or faces, and masks with a PINHOLE model, moved into place when whole."""
 
 from __future__ import annotations
 
 import logging
 import shutil
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
+import torch
 
 from lapgs_plugin.scenes.images import image_size, read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
 from lapgs_plugin.scenes.output import write_model
 from lapgs_plugin.scenes.prepare.job import Job
-from lapgs_plugin.scenes.prepare.photos import quarter_turns, target_name
-from lapgs_plugin.scenes.prepare.undistort import lens_of, move_observations, turn_pose, undistort
+from lapgs_plugin.scenes.prepare.photos import check_targets, quarter_turns
+from lapgs_plugin.scenes.prepare.undistort import (
+    Lens,
+    cut_into_faces,
+    inside,
+    lenses_of,
+    move_observations,
+    turn_pose,
+    undistort,
+)
+from lapgs_plugin.scenes.source import ALL_AROUND
 
 logger = logging.getLogger(__name__)
 
@@ -22,7 +33,8 @@ logger = logging.getLogger(__name__)
 def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes.
 
-    All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size.
+    All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size. Panoramas
+    become faces; one without a pixel inside of the mask is left out.
     """
     shutil.rmtree(job.scene, ignore_errors=True)
     model.tear_down()  # of cameras without photos
@@ -31,30 +43,49 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     if turns:
         logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}
-    lenses = {key: lens_of(camera, sizes[key], job.settings.max_size, turns) for key, camera in model.cameras.items()}
-    masked = job.masks.is_dir()
+    asked = (job.settings.max_size, turns, job.settings.tripod)
+    lenses = {key: lenses_of(camera, sizes[key], *asked) for key, camera in model.cameras.items()}
+    cut = any(lens.face and lens.resized.model.name != ALL_AROUND for own in lenses.values() for lens in own)
+    masked = job.masks.is_dir() or job.settings.tripod > 0 or cut
+    targets = [(lens.name_of(image.name), image.name) for image in images for lens in lenses[image.camera_id]]
+    check_targets(job.source.folder, targets)
 
-    def write(image: pycolmap.Image) -> None:
-        lens = lenses[image.camera_id]
-        size, target = (lens.resized.width, lens.resized.height), target_name(image.name)
-        photo = read_image(job.photo(image.name), size=size, clamp=False)
-        write_image(job.scene / "images" / target, undistort(photo, lens))
-        if not masked:
-            return
-        mask = read_image(job.masks / f"{image.name}.png", size=size)
-        write_mask(job.scene / MASKS / f"{target}.png", undistort(mask, lens)[:1] > 0.5)
+    def write(image: pycolmap.Image) -> list[Lens]:
+        return _write_photo(job, image, lenses[image.camera_id], masked)
 
-    job.each_photo("Undistorting", write, images)
-    for image in images:
-        lens = lenses[image.camera_id]
-        move_observations(image, lens)
-        turn_pose(image, lens)
-        image.name = target_name(image.name)
-    for key, lens in lenses.items():
-        camera, turned = model.cameras[key], lens.turned
-        camera.model, camera.width, camera.height = turned.model, turned.width, turned.height
-        camera.params = list(turned.params)
+    written = job.each_photo("Undistorting", write, images)
+    for image, shown in zip(images, written, strict=True):
+        if shown[0].face is None:
+            move_observations(image, shown[0])
+            turn_pose(image, shown[0])
+            image.name = shown[0].name_of(image.name)
+    for key, (lens, *others) in lenses.items():
+        if not others:
+            camera, turned = model.cameras[key], lens.turned
+            camera.model, camera.width, camera.height = turned.model, turned.width, turned.height
+            camera.params = list(turned.params)
+    cut_into_faces(model, [(image, shown) for image, shown in zip(images, written, strict=True) if shown[0].face])
     write_model(model, job.scene / "sparse" / "0")
+
+
+def _write_photo(job: Job, image: pycolmap.Image, lenses: Sequence[Lens], masked: bool) -> list[Lens]:
+    """Write a photo by each of its lenses, with masks if `masked`, and return those that show something."""
+    size = (lenses[0].resized.width, lenses[0].resized.height)
+    photo = read_image(job.photo(image.name), size=size, clamp=False)
+    file, shown = job.masks / f"{image.name}.png", []
+    mask = read_image(file, size=size) if job.masks.is_dir() else torch.ones(3, *photo.shape[1:])
+    for lens in lenses:
+        target = lens.name_of(image.name)
+        if masked:
+            used = undistort(mask, lens)[:1] > 0.5
+            if lens.face is not None:
+                used &= inside(lens)
+                if not used.any():
+                    continue
+            write_mask(job.scene / MASKS / f"{target}.png", used)
+        write_image(job.scene / "images" / target, undistort(photo, lens))
+        shown.append(lens)
+    return shown
 
 
 def move_into_place(work: Path, out: Path) -> None:

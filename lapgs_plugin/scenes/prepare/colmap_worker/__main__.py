@@ -20,6 +20,8 @@ import pycolmap
 
 SEED = 0
 """Seed of COLMAP's random choices, and of those of features for a vocabulary."""
+FISHEYE_FOCAL = 0.4
+"""Focal length of a fisheye lens in longer sides of the photo, to start from: 143 degrees across."""
 
 MOST_DESCRIPTORS = 65_536
 """Most features that a vocabulary is made of."""
@@ -48,9 +50,17 @@ def _end_with_parent() -> None:
 
 
 def find_features(job: dict[str, Any]) -> None:
-    """Extract features. Keys: database, photos, names, camera_model, single_camera, max_size and masks (or None)."""
-    mode = pycolmap.CameraMode.SINGLE if job["single_camera"] else pycolmap.CameraMode.AUTO
+    """Extract features.
+
+    Keys: database, photos, names, camera_model, camera_mode (a name), max_size and masks (or None), rig (a list of
+    cameras, the reference first: prefix of its images' names, turn (3, 3) against the reference, size, params of a
+    PINHOLE camera).
+    """
+    mode = pycolmap.CameraMode.__members__[job["camera_mode"]]
     reader = pycolmap.ImageReaderOptions(camera_model=job["camera_model"])
+    fisheye = "FISHEYE" in job["camera_model"]
+    if fisheye:
+        reader.default_focal_length_factor = FISHEYE_FOCAL
     if job["masks"] is not None:
         reader.mask_path = job["masks"]
     options = pycolmap.FeatureExtractionOptions(use_gpu=pycolmap.has_cuda)
@@ -65,7 +75,26 @@ def find_features(job: dict[str, Any]) -> None:
             Path(job["database"] + suffix).unlink(missing_ok=True)
         pycolmap.Database.open(job["database"]).close()
         pycolmap.import_images(job["database"], job["photos"], mode, job["names"], reader)
+        if fisheye:  # lines are so bent that no pair has a geometry without calibration
+            with pycolmap.Database.open(job["database"]) as database:
+                for camera in database.read_all_cameras():
+                    camera.has_prior_focal_length = True
+                    database.update_camera(camera)
     pycolmap.extract_features(job["database"], job["photos"], job["names"], mode, reader, options)
+    if job["rig"]:
+        with pycolmap.Database.open(job["database"]) as database:
+            pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=list(map(_sensor, job["rig"])))], database)
+
+
+def _sensor(values: dict[str, Any]) -> pycolmap.RigConfigCamera:
+    width, height = values["size"]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=values["params"])
+    camera.has_prior_focal_length = True
+    turn, reference = np.array(values["turn"]), values["turn"] == np.eye(3).tolist()
+    sensor = pycolmap.RigConfigCamera(ref_sensor=reference, image_prefix=values["prefix"], camera=camera)
+    if not reference:
+        sensor.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+    return sensor
 
 
 def match_pairs(job: dict[str, Any]) -> None:
@@ -73,9 +102,12 @@ def match_pairs(job: dict[str, Any]) -> None:
 
     Keys: database, matcher, similar (photos to compare with by looks), every (distance of photos that sequential
     matching compares so, 0 for none), tree (a file to write), guided (match more features of pairs with a geometry; may
-    be missing). Pairs that the database has a geometry of are left alone.
+    be missing), rig (whether photos of a frame share a centre; may be missing). Pairs that the database has a geometry
+    of are left alone.
     """
     matching = pycolmap.FeatureMatchingOptions(use_gpu=pycolmap.has_cuda, guided_matching=job.get("guided", False))
+    if job.get("rig"):
+        matching.rig_verification = matching.skip_image_pairs_in_same_frame = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     if job["matcher"] == "exhaustive":
@@ -87,7 +119,7 @@ def match_pairs(job: dict[str, Any]) -> None:
         alike = pycolmap.VocabTreePairingOptions(vocab_tree_path=job["tree"], num_images=job["similar"])
         pycolmap.match_vocabtree(job["database"], matching, alike, verification)
     else:
-        neighbours = pycolmap.SequentialPairingOptions()
+        neighbours = pycolmap.SequentialPairingOptions(expand_rig_images=bool(job.get("rig")))
         if job["every"]:
             _make_tree(job["database"], job["tree"])
             neighbours.loop_detection, neighbours.vocab_tree_path = True, job["tree"]
@@ -117,16 +149,24 @@ def map_photos(job: dict[str, Any]) -> None:
     """Recover models.
 
     Keys: database, photos, models (an empty folder), placed (a file that gets a line per model, a byte per photo),
-    mapper ("incremental" or "global"), camera_model (to fit instead of the database's; may be missing).
+    mapper ("incremental" or "global"), camera_model (to fit instead of the database's; may be missing), rig (whether
+    lenses and rig are known).
     """
     if "camera_model" in job:
         replace_cameras(job["database"], job["camera_model"])
     if job["mapper"] == "global":
         whole = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+        if job["rig"]:
+            whole.mapper.refine_sensor_from_rig = False
+            lenses = whole.mapper.bundle_adjustment
+            lenses.refine_focal_length = lenses.refine_principal_point = lenses.refine_extra_params = False
         pycolmap.global_mapping(job["database"], job["photos"], job["models"], whole)
         return
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.mapper.random_seed = options.triangulation.random_seed = SEED
+    if job["rig"]:
+        options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+        options.ba_refine_sensor_from_rig = False
     with pycolmap.Database.open(job["database"]) as database:
         residuals = 2 * database.num_keypoints()  # at most
     if residuals < options.ba_min_num_residuals_for_cpu_multi_threading:
