@@ -226,10 +226,10 @@ class TrainSettings(HierarchySettings):
         choices=(AUTO, ON, OFF),
     )
     depth: str = option(
-        AUTO,
+        "none",
         "Supervise depth in all levels but residuals: a folder of depth maps named as the photos (16-bit PNG, EXR, "
-        "NPY), points (those of COLMAP that a photo sees), none, or auto (depth_file_path of transforms.json, the "
-        "scene's folder depth/ or that of an export, or none).",
+        "NPY), points (those of COLMAP that a photo sees), auto (depth_file_path of transforms.json, the scene's folder "
+        "depth/ or that of an export, or none of them), or none.",
         panel=SCHEDULE,
     )
     refine_poses: bool = option(

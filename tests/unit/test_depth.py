@@ -157,7 +157,9 @@ def test_only_unusable_maps_are_an_error_of_one_line(scene: Path, write: object,
     assert callable(write)
     write(scene / "depth" / "0000.png")
     assert "--depth none" in refuses(SceneError, facts, loaded, scene)
-    result = CliRunner().invoke(app, ["train", str(scene), "-o", str(scene / "run"), "--iterations", "20"])
+    result = CliRunner().invoke(
+        app, ["train", str(scene), "-o", str(scene / "run"), "--iterations", "20", "--depth", "auto"]
+    )
     assert isinstance(result.exception, SceneError)
     assert result.exception.exit_code == 2
     assert not (scene / "run").exists()
