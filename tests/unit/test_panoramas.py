@@ -87,7 +87,7 @@ def shown(view: View) -> Array:
 
 
 # Worst: 55.5 dB of waves. 8 bits and the filter leave 32.0 of Gaussians, whose shapes are linearized in each camera,
-# and 31.1 of a room with sharp edges. Photos that are shifted by half a pixel have 41.0, 31.7 and 27.0.
+# and 31.1 of a room with sharp edges. Panoramas averaged with themselves, shifted by a pixel, have 41.0, 31.7 and 27.0.
 @pytest.mark.parametrize(("view", "least"), [(waves, 55.0), (cloud_view, 31.8), (room_view, 30.8)])
 def test_faces_show_what_pinhole_cameras_see(view: Renderer, least: float, tmp_path: Path) -> None:
     poses, names = walk(2), ["a 0.png", "b.png"]
