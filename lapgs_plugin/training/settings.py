@@ -228,8 +228,8 @@ class TrainSettings(HierarchySettings):
     depth: str = option(
         "none",
         "Supervise depth in all levels but residuals: a folder of depth maps named as the photos (16-bit PNG, EXR, "
-        "NPY), points (those of COLMAP that a photo sees), auto (depth_file_path of transforms.json, the scene's folder "
-        "depth/ or that of an export, or none of them), or none.",
+        "NPY), points (those of COLMAP that a photo sees), auto (depth_file_path of transforms.json, the scene's "
+        "folder depth/ or that of an export, or none of them), or none.",
         panel=SCHEDULE,
     )
     refine_poses: bool = option(
