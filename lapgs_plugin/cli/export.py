@@ -47,8 +47,8 @@ class ExportSettings:
     iterations: int | None = option(None, "With --merge: iterations of the fit, one view each. Default: 3000.", least=1)
     html: bool = option(
         False,
-        "Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
-        "level_<l>_base.html or level_<l>_field.html.",
+        "Write scene.html instead: a viewer with the scene in one file, which opens offline and shows coarse levels "
+        "while it loads. With --level: level_<l>_base.html or level_<l>_field.html.",
     )
     lod: bool = option(
         False,
