@@ -42,6 +42,9 @@ INVISIBLE = 1.0 / 255.0
 PART = 65_536
 """Gaussians of one part of a level, which a browser unpacks while the next one arrives."""
 
+FIRST_PART = 16_384
+"""Gaussians of the first part of a level, for an early first picture."""
+
 SETS = 32_768
 """Most sets of coefficients in the palette: half of what SOG allows, as they would be 40 % of the page."""
 
@@ -131,7 +134,7 @@ def pack_level(field: GaussianField, *, shaded: bool) -> PackedLevel:
     opacities = (torch.sigmoid(field.opacity_logits) * 255.0).round().byte().numpy()[:, None]
     rotations = packed_rotations(field.quaternions)
     rows = np.concatenate([low_and_high(positions), scales, colors, opacities, rotations], axis=1)  # (n, 17)
-    parts = [_compressed(rows[first : first + PART]) for first in range(0, len(rows), PART)]
+    parts = [_compressed(part) for part in np.split(rows, np.cumsum(_sizes(len(rows)))[:-1])]
     header |= {"low": low.tolist(), "high": high.tolist(), "parts": len(parts)}
     if shaded and field.sh_degree > 0:
         sets, labels = palette(field.sh[:, 1:], SETS)
@@ -145,10 +148,17 @@ def _order(field: GaussianField) -> Tensor:
     """Return the visible Gaussians: the most important part first, neighbours in a part beside each other."""
     opacities = torch.sigmoid(field.opacity_logits)
     order = (opacities.log() + field.log_scales.sum(dim=1)).argsort(descending=True)
-    parts = torch.split(order[opacities[order] >= INVISIBLE], PART)
-    if len(parts[0]) == 0:
-        return parts[0]
+    order = order[opacities[order] >= INVISIBLE]
+    if len(order) == 0:
+        return order
+    parts = torch.split(order, _sizes(len(order)))
     return torch.cat([part[torch.from_numpy(morton_order(field.means[part].numpy()))] for part in parts])
+
+
+def _sizes(count: int) -> list[int]:
+    """Return how many Gaussians the parts of a level have."""
+    first = min(count, FIRST_PART)
+    return [first, *(min(PART, count - start) for start in range(first, count, PART))]
 
 
 def _compressed(*tables: NDArray[np.uint8]) -> bytes:

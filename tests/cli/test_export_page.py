@@ -95,13 +95,14 @@ def _gaussians(header: dict[str, Any], planes: NDArray[Any], sh: NDArray[Any]) -
 def test_a_page_has_the_visible_gaussians_rounded_the_most_important_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(splat_page, "PART", 20)
+    monkeypatch.setattr(splat_page, "FIRST_PART", 9)
+    monkeypatch.setattr(splat_page, "PART", 25)
     field = colorful(50)
     logits = field.opacity_logits.clone()
     logits[7] = -9.0  # invisible
     write_splat_page([replace(field, opacity_logits=logits)], tmp_path / "page.html", "page", [ring_camera(0.0)], BLACK)
     (parts,) = read_page(tmp_path / "page.html")
-    assert [len(part) for part in parts] == [20, 20, 9]
+    assert [len(part) for part in parts] == [9, 25, 15]
     importance = [torch.sigmoid(part.opacity_logits) * part.log_scales.sum(dim=1).exp() for part in parts]
     for first, second in pairwise(importance):
         assert first.min() >= 0.98 * second.max()  # both are rounded
