@@ -47,8 +47,8 @@ class ExportSettings:
     iterations: int | None = option(None, "With --merge: iterations of the fit, one view each. Default: 3000.", least=1)
     html: bool = option(
         False,
-        "Write scene.html instead: a viewer with the scene in one file, which opens offline. With --level: "
-        "level_<l>_base.html or level_<l>_field.html.",
+        "Write scene.html instead: a viewer with the scene in one file, which opens offline and shows coarse levels "
+        "while it loads. With --level: level_<l>_base.html or level_<l>_field.html.",
     )
     lod: bool = option(
         False,
@@ -145,31 +145,47 @@ def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -
 
 def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
     """Write one field, merged or of a level (by default the finest), as a file or a page."""
-    from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
-    from lapgs_plugin.rendering.run import run_cameras
-    from lapgs_plugin.reports.splat_page import write_splat_page
-
     chosen = archive.manifest.record(settings.level or 0).level
     field = _merged(archive, settings.scene, settings.iterations) if settings.merge else archive.field(chosen)
-    field = _cleaned(archive, {chosen: field}, settings, settings.merge)[chosen]
     if field.signed:
         raise UserInputError(
             f"{archive.path()}: level {chosen} is a residual, which no viewer shows by itself; add --merge to fit one "
             "field to the run"
         )
-    if not settings.html:
-        _make(folder)
-        path = folder / f"{MERGED}{SUFFIXES[settings.file_format]}"
-        _write_field(field, path, f"one field fitted to the images of {archive.name}", settings.file_format)
-        _print_written(path, field)
+    if settings.html:
+        _write_page(archive, settings, folder, chosen, field)
         return
+    field = _cleaned(archive, {chosen: field}, settings, settings.merge)[chosen]
+    _make(folder)
+    path = folder / f"{MERGED}{SUFFIXES[settings.file_format]}"
+    _write_field(field, path, f"one field fitted to the images of {archive.name}", settings.file_format)
+    _print_written(path, field)
+
+
+def _write_page(archive: RunArchive, settings: ExportSettings, folder: Path, level: int, field: GaussianField) -> None:
+    """Write the page of a field, with the coarser levels of the run that it shows before the field has arrived."""
+    from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
+    from lapgs_plugin.rendering.run import run_cameras
+    from lapgs_plugin.reports.splat_page import shown_first, write_splat_page
+
     cameras = list(run_cameras(archive, settings.scene)[0].values())
+    coarser = {number: archive.field(number) for number in archive.available_levels if number > level}
+    coarser = {number: one for number, one in sorted(coarser.items()) if not one.signed}
+    numbers = [level, *coarser]
+    *first, _ = [numbers[index] for index in shown_first([len(field), *map(len, coarser.values())])]
+    fields = {number: coarser[number] for number in first}
+    if settings.merge:
+        fields = _cleaned(archive, fields, settings) | _cleaned(archive, {level: field}, settings, merged=True)
+    else:
+        fields = _cleaned(archive, fields | {level: field}, settings)
     _make(folder)
     # Pages of several levels can lie beside each other.
     path = folder / (PAGE if settings.level is None else f"{_level_name(archive, settings.level)}.html")
     scene = archive.manifest.scene
-    write_splat_page(field, path, archive.name, cameras, scene.background, NEAR_DEPTH * scene.unit)
-    _print_written(path, field, ", opens in a browser without a network")
+    levels = [fields[number] for number in (*first, level)]
+    write_splat_page(levels, path, archive.name, cameras, scene.background, NEAR_DEPTH * scene.unit)
+    before = "".join(f"after level {number}, " for number in first)
+    _print_written(path, levels[-1], f", {before}opens in a browser without a network")
 
 
 def _write_lod(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
@@ -250,7 +266,7 @@ def _cleaned(
     Args:
         fields: of some levels, or the merged one at level 0.
     """
-    if not settings.clean and settings.crop is None:
+    if not fields or (not settings.clean and settings.crop is None):
         return fields
     from lapgs_plugin.evaluation.cleaning import clean_levels
     from lapgs_plugin.fields.crop import Crop

@@ -26,26 +26,19 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.quantization import (
+    Bytes,
+    codebook,
+    fixed_point,
+    low_and_high,
+    morton_order,
+    packed_rotations,
+    palette,
+)
 from lapgs_plugin.files import atomic_write
 from lapgs_plugin.progress import item_progress
 
 META, LOD_META = "meta.json", "lod-meta.json"
-CODES = 256
-CODE_ROUNDS = 20
-"""Rounds of k-means over one number."""
-
-MOST_SETS = 65_536
-"""Sets of coefficients in a palette: labels have 16 bits."""
-
-ROWS_FOR_A_SET = 2
-"""Gaussians that share a set of a palette, on average, at least."""
-
-SET_ROUNDS = 8
-"""Rounds of k-means over sets of coefficients."""
-
-ROWS_AT_ONCE = 65_536
-"""Rows whose distances from all centres are in memory together."""
-
 COLUMNS = 64
 """Sets in one row of a palette's image."""
 
@@ -57,8 +50,6 @@ FILE = 524_288
 
 NOT_ZERO = (0.0, 0.0, 0.0, 1e-100)
 """Added to a quaternion xyzw, so that one of zeros has a direction."""
-
-Bytes = NDArray[np.uint8]
 
 
 def save_sog(gaussians: GaussianField, folder: Path) -> None:
@@ -74,17 +65,14 @@ def save_sog(gaussians: GaussianField, folder: Path) -> None:
     """
     gaussians = gaussians.detach().to("cpu", torch.float32)
     gaussians.require_finite()
-    means = gaussians.means.double()
-    folded = (means.sign() * means.abs().log1p()).numpy()  # (n, 3)
-    low, high = folded.min(axis=0), folded.max(axis=0)
-    fixed = np.rint(65_535.0 * (folded - low) / np.where(high > low, high - low, 1.0)).astype(np.uint16)
-    scale_codes, scales = _codebook(gaussians.log_scales.numpy())
-    color_codes, colors = _codebook(gaussians.sh[:, 0].numpy())
+    low, high, fixed = fixed_point(gaussians.means)
+    scale_codes, scales = codebook(gaussians.log_scales.numpy())
+    color_codes, colors = codebook(gaussians.sh[:, 0].numpy())
     opacities = np.rint(255.0 * torch.sigmoid(gaussians.opacity_logits).numpy()).astype(np.uint8)
     images = {
-        "means_l.webp": _texture((fixed & 255).astype(np.uint8)),
-        "means_u.webp": _texture((fixed >> 8).astype(np.uint8)),
-        "quats.webp": _texture(_rotations(gaussians.quaternions)),
+        "means_l.webp": _texture(low_and_high(fixed)[:, :3]),
+        "means_u.webp": _texture(low_and_high(fixed)[:, 3:]),
+        "quats.webp": _texture(packed_rotations(gaussians.quaternions)),
         "scales.webp": _texture(scales),
         "sh0.webp": _texture(np.concatenate([colors, opacities[:, None]], axis=1)),
     }
@@ -98,10 +86,13 @@ def save_sog(gaussians: GaussianField, folder: Path) -> None:
         "sh0": {"codebook": color_codes, "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree > 0:
-        palette, labels = _palette(gaussians.sh[:, 1:])
-        rest_codes, sets = _codebook(palette)
+        rest, labels = palette(gaussians.sh[:, 1:])
+        rest_codes, sets = codebook(rest)
         files = ["shN_centroids.webp", "shN_labels.webp"]
-        images |= {files[0]: _palette_texture(sets), files[1]: _texture(_low_and_high(labels))}
+        images |= {
+            files[0]: _palette_texture(sets),
+            files[1]: _texture(np.pad(low_and_high(labels[:, None]), ((0, 0), (0, 1)))),
+        }
         meta["shN"] = {"count": len(sets), "bands": gaussians.sh_degree, "codebook": rest_codes, "files": files}
     folder.mkdir(parents=True, exist_ok=True)
     for name, pixels in images.items():
@@ -178,7 +169,7 @@ class _Layout:
         lods = {}
         for level in np.unique(self.level[members]).tolist():
             rows = members[self.level[members] == level]
-            rows = rows[_morton_order(self.means[rows])]
+            rows = rows[morton_order(self.means[rows])]
             lods[str(level)] = self._put(level, rows - self.first[level])
         low = (self.means[members] - self.reach[members]).min(axis=0)
         return {"bound": _bound(low, (self.means[members] + self.reach[members]).max(axis=0)), "lods": lods}
@@ -206,85 +197,6 @@ def _reach(one: GaussianField) -> Tensor:
     rotations = torch.from_numpy(Rotation.from_quat(xyzw).as_matrix()).float()
     reach: Tensor = (rotations * one.log_scales.exp()[:, None]).norm(dim=2)
     return reach
-
-
-def _morton_order(points: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the order of points (n, 3) along a Z-shaped curve, in which neighbours are similar."""
-    low, extent = points.min(axis=0), np.ptp(points, axis=0)
-    cells = ((points - low) / np.where(extent > 0.0, extent, 1.0) * 1023.0).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
-def _rotations(quaternions: Tensor) -> Bytes:
-    """Return rotations as (n, 4) bytes: the three smaller components in the order wxyz, then 252 + the largest."""
-    unit = torch.nn.functional.normalize(quaternions.double(), dim=1).numpy()
-    largest = np.abs(unit).argmax(axis=1)
-    unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0.0, -1.0, 1.0)
-    others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    small = np.rint(255.0 * (others * math.sqrt(0.5) + 0.5))
-    return np.concatenate([small, 252.0 + largest[:, None]], axis=1).astype(np.uint8)
-
-
-def _codebook(values: NDArray[Any]) -> tuple[list[float], Bytes]:
-    """Return 256 numbers by k-means, ascending, and the index of the nearest one to each value."""
-    ordered = np.sort(values, axis=None).astype(np.float64)
-    if len(different := np.unique(ordered)) <= CODES:
-        return np.pad(different, (0, CODES - len(different)), "edge").tolist(), _nearest(different, values)
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Between equal numbers of values and equal distances, so that rare values get codes, too.
-    shares = (np.arange(CODES) + 0.5) / CODES
-    codes = (np.quantile(ordered, shares) + ordered[0] + shares * (ordered[-1] - ordered[0])) / 2.0
-    for _ in range(CODE_ROUNDS):
-        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2.0), [len(ordered)]])
-        counts = np.diff(ends)
-        codes = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), codes)
-    return codes.tolist(), _nearest(codes, values)
-
-
-def _nearest(codes: NDArray[np.float64], values: NDArray[Any]) -> Bytes:
-    """Return the index of the nearest of at most 256 ascending numbers to each value."""
-    return np.searchsorted((codes[1:] + codes[:-1]) / 2.0, values).astype(np.uint8)
-
-
-def _palette(coefficients: Tensor) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return a palette (count, k, 3) of sets of coefficients, and the label (n,) of each Gaussian's set.
-
-    Gaussians are grouped coarsely, then each group by itself, which takes far less time than one step.
-    """
-    rows = coefficients.flatten(1)  # (n, 3 k)
-    count = min(MOST_SETS, -(-len(rows) // ROWS_FOR_A_SET))
-    generator = torch.Generator().manual_seed(0)
-    _, groups = _clusters(rows, math.isqrt(count), generator)
-    labels, parts, used = torch.empty(len(rows), dtype=torch.long), [], 0
-    for group in range(int(groups.max()) + 1):
-        members = (groups == group).nonzero()[:, 0]
-        if len(members):
-            centres, own = _clusters(rows[members], max(1, count * len(members) // len(rows)), generator)
-            labels[members] = own + used
-            parts.append(centres)
-            used += len(centres)
-    return torch.cat(parts).view(used, *coefficients.shape[1:]).numpy(), labels.numpy()
-
-
-def _clusters(rows: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return `count` centres by k-means, and the label of each row's nearest one."""
-    centres = rows[torch.randperm(len(rows), generator=generator)[:count]]
-    for last in [False] * SET_ROUNDS + [True]:
-        labels = torch.cat([torch.cdist(part, centres).argmin(dim=1) for part in torch.split(rows, ROWS_AT_ONCE)])
-        if not last:
-            sums = torch.zeros_like(centres).index_add_(0, labels, rows)
-            members = torch.bincount(labels, minlength=len(centres))[:, None]
-            centres = torch.where(members > 0, sums / members.clamp(min=1), centres)
-    return centres, labels
-
-
-def _low_and_high(labels: NDArray[np.int64]) -> Bytes:
-    """Return labels of 16 bits as (n, 3) bytes: the low one, the high one, zero."""
-    return np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
 
 
 def _texture(values: Bytes) -> Bytes:

@@ -1,21 +1,30 @@
 "use strict";
 // Draw Gaussians, sorted by depth, as quads that blend over each other. Coordinates are those of 3DGS: x right, y down,
-// z forward in the camera.
+// z forward in the camera. Levels of detail arrive in parts while the page loads, the coarsest first.
 
-const ROW = 1024;  // Gaussians in a row of the texture; each takes two texels of 16 bytes
+const ROW = 1024;  // Gaussians in a row of a texture
+const WORDS = 8;  // of a Gaussian: position (3 floats), rotation, scale, colour and opacity, label, unused
+const PLANES = 17;  // bytes of a Gaussian in a part
+const COLUMNS = 64;  // sets of coefficients in a row of their texture
 const BUCKETS = 65536;
 const START = JSON.parse(document.getElementById("start").textContent);
 const NEAR = START.near;  // the least depth that is drawn
 
-const VERTEX = `#version 300 es
+const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp usampler2D;
+uvec4 bytes(uint word) { return uvec4(word, word >> 8, word >> 16, word >> 24) & 255u; }
+`;
+
+const VERTEX = HEAD + `
 uniform usampler2D splats;
+uniform sampler2D colors;
 uniform mat3 rotation;
 uniform vec3 place;
 uniform float focal;
 uniform vec2 size;
+uniform vec4 scales[64];
 layout(location = 0) in uint index;
 out vec4 color;
 out vec2 offset;
@@ -27,18 +36,31 @@ mat3 matrix(vec4 q) {
               2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
+/** Return the quaternion wxyz of its three smaller components and the index of the largest one. */
+vec4 quaternion(uvec4 code) {
+  vec3 small = (vec3(code.xyz) / 255.0 - 0.5) * sqrt(2.0);
+  float large = sqrt(max(0.0, 1.0 - dot(small, small)));
+  uint at = code.w - 252u;
+  if (at == 0u) return vec4(large, small);
+  if (at == 1u) return vec4(small.x, large, small.yz);
+  return at == 2u ? vec4(small.xy, large, small.z) : vec4(small, large);
+}
+
+float logScale(uint code) { return scales[code >> 2][code & 3u]; }
+
 void main() {
-  ivec2 at = ivec2(int(index % ${ROW}u) * 2, int(index / ${ROW}u));
-  uvec4 first = texelFetch(splats, at, 0), second = texelFetch(splats, at + ivec2(1, 0), 0);
+  ivec2 at = ivec2(int(index % ${ROW}u), int(index / ${ROW}u));
+  uvec4 first = texelFetch(splats, at * ivec2(2, 1), 0), second = texelFetch(splats, at * ivec2(2, 1) + ivec2(1, 0), 0);
   vec3 center = rotation * (uintBitsToFloat(first.xyz) - place);
-  vec3 scale = uintBitsToFloat(uvec3(first.w, second.xy));
-  color = vec4(uvec4(second.z, second.z >> 8, second.z >> 16, second.z >> 24) & 255u) / 255.0;
-  vec4 q = vec4(uvec4(second.w, second.w >> 8, second.w >> 16, second.w >> 24) & 255u) - 128.0;
+  uvec4 codes = bytes(second.x);
+  vec3 scale = exp(vec3(logScale(codes.x), logScale(codes.y), logScale(codes.z)));
+  color = texelFetch(colors, at, 0);
+  vec4 q = quaternion(bytes(first.w));
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   if (center.z < ${NEAR} || color.a * 255.0 <= 1.0) return;
 
   // The covariance in the image: J V S S V^T J^T with the Jacobian J of the projection (Zwicker et al. 2001).
-  mat3 axes = rotation * matrix(normalize(q)) * mat3(scale.x, 0, 0, 0, scale.y, 0, 0, 0, scale.z);
+  mat3 axes = rotation * matrix(q) * mat3(scale.x, 0, 0, 0, scale.y, 0, 0, 0, scale.z);
   vec2 limit = 0.65 * size / focal;
   vec2 slope = clamp(center.xy / center.z, -limit, limit);
   vec3 across = focal / center.z * (vec3(axes[0].x, axes[1].x, axes[2].x) - slope.x * vec3(axes[0].z, axes[1].z, axes[2].z));
@@ -55,8 +77,7 @@ void main() {
   gl_Position = vec4(2.0 * pixel / size * vec2(1, -1), 0, 1);
 }`;
 
-const FRAGMENT = `#version 300 es
-precision highp float;
+const FRAGMENT = HEAD + `
 in vec4 color;
 in vec2 offset;
 out vec4 result;
@@ -64,6 +85,46 @@ void main() {
   float alpha = min(0.99, color.a * exp(-0.5 * dot(offset, offset)));
   if (alpha < 1.0 / 255.0) discard;
   result = vec4(color.rgb * alpha, alpha);
+}`;
+
+const CORNERS = HEAD + `
+void main() { gl_Position = vec4(4.0 * float(gl_VertexID & 1) - 1.0, 4.0 * float(gl_VertexID >> 1) - 1.0, 0, 1); }`;
+
+// Spherical harmonics up to degree 3, in the order and with the signs of 3DGS.
+const SHADE = HEAD + `
+uniform usampler2D splats;
+uniform usampler2D sets;
+uniform vec3 place;
+uniform int degree;
+uniform vec4 colors[64];
+uniform vec4 rest[64];
+out vec4 result;
+
+float base(uint code) { return colors[code >> 2][code & 3u]; }
+float higher(uint code) { return rest[code >> 2][code & 3u]; }
+
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy) * ivec2(2, 1);
+  uvec4 first = texelFetch(splats, at, 0), second = texelFetch(splats, at + ivec2(1, 0), 0);
+  uvec4 code = bytes(second.y);
+  vec3 color = 0.5 + ${Math.sqrt(1 / (4 * Math.PI))} * vec3(base(code.x), base(code.y), base(code.z));
+  if (degree > 0) {
+    vec3 d = normalize(uintBitsToFloat(first.xyz) - place);
+    float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+    float values[15] = float[15](
+      -0.4886025119 * y, 0.4886025119 * z, -0.4886025119 * x,
+      1.0925484306 * x * y, -1.0925484306 * y * z, 0.3153915653 * (2.0 * zz - xx - yy), -1.0925484306 * x * z,
+      0.5462742153 * (xx - yy),
+      -0.5900435899 * y * (3.0 * xx - yy), 2.8906114426 * x * y * z, -0.4570457995 * y * (4.0 * zz - xx - yy),
+      0.3731763326 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -0.4570457995 * x * (4.0 * zz - xx - yy),
+      1.4453057213 * z * (xx - yy), -0.5900435899 * x * (xx - 3.0 * yy));
+    int count = (degree + 1) * (degree + 1) - 1, label = int(second.z);
+    for (int k = 0; k < count; k++) {
+      uvec3 set = texelFetch(sets, ivec2(label % ${COLUMNS} * count + k, label / ${COLUMNS}), 0).xyz;
+      color += values[k] * vec3(higher(set.x), higher(set.y), higher(set.z));
+    }
+  }
+  result = vec4(max(color, 0.0), float(code.w) / 255.0);
 }`;
 
 const add = (a, b) => a.map((value, i) => value + b[i]);
@@ -78,12 +139,68 @@ function turned(v, axis, angle) {
   return v.map((value, i) => value * c + cross[i] * s + axis[i] * dot(axis, v) * (1 - c));
 }
 
-/** Return the bytes of base64 text, filled up to whole rows of the texture. */
-function decode(text) {
-  const binary = atob(text.trim()), count = binary.length / 32;
-  const bytes = new Uint8Array(Math.max(1, Math.ceil(count / ROW)) * ROW * 32);
-  for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
-  return [bytes, count];
+/** Return what base64 text holds, which zlib has compressed. */
+async function unpack(text) {
+  const binary = atob(text), bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  if (!window.DecompressionStream) throw new Error("this browser is too old: it has no DecompressionStream");
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** Gaussians of one level of detail, as many as have arrived: eight words each, filled up to rows of a texture. */
+class Level {
+  constructor(header) {
+    Object.assign(this, header);
+    this.rows = Math.max(1, Math.ceil(this.count / ROW));
+    this.words = new Uint32Array(this.rows * ROW * WORDS);
+    this.floats = new Float32Array(this.words.buffer);
+    this.filled = 0;
+    this.shaded = false;
+    this.positions = this.count ? [0, 1, 2].map((axis) => this.table(axis)) : [];
+  }
+
+  get complete() {
+    return this.filled === this.count;
+  }
+
+  /** Return the coordinate that each number of 16 bits stands for. */
+  table(axis) {
+    const table = new Float32Array(65536), step = (this.high[axis] - this.low[axis]) / 65535;
+    for (let i = 0; i < table.length; i++) {
+      const folded = this.low[axis] + i * step;
+      table[i] = Math.sign(folded) * Math.expm1(Math.abs(folded));
+    }
+    return table;
+  }
+
+  /** Append the Gaussians of a part. */
+  append(bytes) {
+    const { words, floats, positions } = this, count = bytes.length / PLANES;
+    const plane = (index) => bytes.subarray(index * count, (index + 1) * count);
+    const planes = Array.from({ length: PLANES }, (_, index) => plane(index));
+    for (let i = 0, at = this.filled * WORDS; i < count; i++, at += WORDS) {
+      const byte = (index) => planes[index][i];
+      const word = (p) => byte(p) | byte(p + 1) << 8 | byte(p + 2) << 16 | byte(p + 3) << 24;
+      for (let axis = 0; axis < 3; axis++) {
+        floats[at + axis] = positions[axis][byte(axis) | byte(axis + 3) << 8];
+      }
+      words[at + 3] = word(13);
+      words[at + 4] = word(6) & 0xffffff;
+      words[at + 5] = word(9);
+    }
+    this.filled += count;
+  }
+
+  /** Take the label of each Gaussian, and return the sets of coefficients: bytes RGB in rows of 64 sets. */
+  shade(bytes) {
+    const { words, count, sets, degree } = this, size = 3 * ((degree + 1) ** 2 - 1);
+    for (let i = 0; i < count; i++) words[i * WORDS + 6] = bytes[i] | bytes[count + i] << 8;
+    const texels = new Uint8Array(Math.ceil(sets / COLUMNS) * COLUMNS * size);
+    texels.set(bytes.subarray(2 * count));
+    this.shaded = true;
+    return texels;
+  }
 }
 
 class Camera {
@@ -125,20 +242,24 @@ class Camera {
 }
 
 class Sorter {
-  constructor(bytes, count) {
-    this.floats = new Float32Array(bytes.buffer);
+  constructor() {
+    this.counts = new Uint32Array(BUCKETS + 1);
+    this.hold(0);
+  }
+
+  /** Make room for so many Gaussians. */
+  hold(count) {
     this.depths = new Float32Array(count);
     this.order = new Uint32Array(count);
-    this.counts = new Uint32Array(BUCKETS + 1);
   }
 
   /** Sort the Gaussians in front of the camera, the farthest first; return their number. */
-  sort(place, forward) {
-    const { floats, depths, order, counts } = this;
+  sort(floats, place, forward) {
+    const { depths, order, counts } = this;
     const [x, y, z] = forward, shift = dot(place, forward);
     let [least, most] = [Infinity, -Infinity];
     for (let i = 0; i < depths.length; i++) {
-      const depth = depths[i] = floats[8 * i] * x + floats[8 * i + 1] * y + floats[8 * i + 2] * z - shift;
+      const depth = depths[i] = floats[WORDS * i] * x + floats[WORDS * i + 1] * y + floats[WORDS * i + 2] * z - shift;
       if (depth < NEAR) continue;
       if (depth < least) least = depth;
       if (depth > most) most = depth;
@@ -157,46 +278,116 @@ class Sorter {
   }
 }
 
+/** What the graphics card holds of a level: Gaussians, their colours seen from the camera, sets of coefficients. */
+class LevelTextures {
+  constructor(gl, level) {
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (level.rows > most) throw new Error("more Gaussians than this graphics card can hold");
+    Object.assign(this, { gl, level });
+    this.splats = this.texture(gl.RGBA32UI, 2 * ROW, level.rows);
+    // As in rasterizers, a colour may be brighter than white before it is blended.
+    const bright = ["EXT_color_buffer_float", "EXT_color_buffer_half_float"].some((name) => gl.getExtension(name));
+    this.colors = this.texture(bright ? gl.RGBA16F : gl.RGBA8, ROW, level.rows);
+    this.sets = this.texture(gl.RGB8UI, 1, 1);
+    this.target = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.colors, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+
+  texture(format, width, height) {
+    const gl = this.gl, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    return texture;
+  }
+
+  /** Copy the Gaussians from a number on. */
+  update(first) {
+    const gl = this.gl, { words, filled } = this.level;
+    const row = Math.floor(first / ROW), rows = Math.ceil(filled / ROW) - row;
+    if (rows <= 0) return;
+    gl.bindTexture(gl.TEXTURE_2D, this.splats);
+    const values = words.subarray(row * ROW * WORDS, (row + rows) * ROW * WORDS);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, 2 * ROW, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, values);
+  }
+
+  hold(sets) {
+    const gl = this.gl, width = COLUMNS * ((this.level.degree + 1) ** 2 - 1), height = sets.length / width / 3;
+    gl.deleteTexture(this.sets);
+    this.sets = this.texture(gl.RGB8UI, width, height);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGB_INTEGER, gl.UNSIGNED_BYTE, sets);
+    this.update(0);  // the labels
+  }
+
+  remove() {
+    for (const texture of [this.splats, this.colors, this.sets]) this.gl.deleteTexture(texture);
+    this.gl.deleteFramebuffer(this.target);
+  }
+}
+
 class Viewer {
-  constructor(canvas, bytes, count, start) {
+  constructor(canvas, start) {
     this.canvas = canvas;
     this.start = start;
     this.camera = new Camera(start);
-    this.sorter = new Sorter(bytes, count);
+    this.sorter = new Sorter();
+    this.complete = false;
+    this.levels = start.levels.map((header) => new Level(header));
     this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!this.gl) throw new Error("this browser has no WebGL 2, which the viewer needs");
-    this.prepare(bytes);
+    this.prepare();
     this.listen();
-    this.draw();
   }
 
-  prepare(bytes) {
+  prepare() {
+    const gl = this.gl;
+    this.splatting = this.program(VERTEX, FRAGMENT);
+    this.shading = this.program(CORNERS, SHADE);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.clearColor(...this.start.background, 1);
+  }
+
+  program(...sources) {
     const gl = this.gl, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-      const shader = gl.createShader(kind);
+    sources.forEach((source, index) => {
+      const shader = gl.createShader([gl.VERTEX_SHADER, gl.FRAGMENT_SHADER][index]);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
       gl.attachShader(program, shader);
-    }
+    });
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    gl.useProgram(program);
-    this.uniform = (name) => gl.getUniformLocation(program, name);
-    const rows = bytes.length / 32 / ROW;
-    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("more Gaussians than this graphics card can hold");
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    const values = new Uint32Array(bytes.buffer);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, 2 * ROW, rows, 0, gl.RGBA_INTEGER, gl.UNSIGNED_INT, values);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.clearColor(...this.start.background, 1);
+    return program;
+  }
+
+  /** Take the next part of the scene. The first level is shown as it comes, others when they are complete. */
+  take(bytes) {
+    const level = this.levels.find((each) => !each.complete || each.degree && !each.shaded);
+    if (this.arriving?.level !== level) this.arriving = new LevelTextures(this.gl, level);
+    const first = level.filled;
+    if (level.complete) {
+      this.arriving.hold(level.shade(bytes));
+    } else {
+      level.append(bytes);
+      this.arriving.update(first);
+    }
+    if (level.complete || level === this.levels[0]) this.show(this.arriving);
+  }
+
+  show(textures) {
+    if (this.shown !== textures) this.shown?.remove();
+    this.shown = textures;
+    this.sorter.hold(textures.level.filled);
+    this.shadedFrom = null;
+    this.later();
   }
 
   /** Focal length in pixels at which the first photo fills the window: what is beside it was never photographed. */
@@ -217,21 +408,65 @@ class Viewer {
     const ratio = Math.min(devicePixelRatio, 2);
     canvas.width = Math.round(canvas.clientWidth * ratio);
     canvas.height = Math.round(canvas.clientHeight * ratio);
-    gl.viewport(0, 0, canvas.width, canvas.height);
-    const shown = this.sorter.sort(camera.place, camera.axes[2]);
-    gl.bufferData(gl.ARRAY_BUFFER, this.sorter.order, gl.DYNAMIC_DRAW);
-    gl.uniformMatrix3fv(this.uniform("rotation"), true, camera.axes.flat());
-    gl.uniform3fv(this.uniform("place"), camera.place);
-    gl.uniform1f(this.uniform("focal"), this.focal);
-    gl.uniform2f(this.uniform("size"), canvas.width, canvas.height);
     gl.clear(gl.COLOR_BUFFER_BIT);
+    if (!this.shown) return;
+    this.shade();
+    const shown = this.sorter.sort(this.shown.level.floats, camera.place, camera.axes[2]);
+    gl.bufferData(gl.ARRAY_BUFFER, this.sorter.order, gl.DYNAMIC_DRAW);
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.enable(gl.BLEND);
+    gl.enableVertexAttribArray(0);
+    const uniform = this.use(this.splatting, this.shown.splats, this.shown.colors);
+    gl.uniform1i(uniform("splats"), 0);
+    gl.uniform1i(uniform("colors"), 1);
+    gl.uniformMatrix3fv(uniform("rotation"), true, camera.axes.flat());
+    gl.uniform3fv(uniform("place"), camera.place);
+    gl.uniform1f(uniform("focal"), this.focal);
+    gl.uniform2f(uniform("size"), canvas.width, canvas.height);
+    if (this.shown.level.scales) gl.uniform4fv(uniform("scales"), this.shown.level.scales);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, shown);
     canvas.dataset.shown = shown;
+    canvas.dataset.level = this.levels.indexOf(this.shown.level);
+    if (this.complete) canvas.dataset.complete = "";
+  }
+
+  /** Compute the colours of all Gaussians from where the camera is. */
+  shade() {
+    const gl = this.gl, { level, target, splats, sets } = this.shown;
+    if (this.shadedFrom === this.camera.place || !level.count) return;
+    this.shadedFrom = this.camera.place;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.viewport(0, 0, ROW, Math.ceil(level.filled / ROW));
+    gl.disable(gl.BLEND);
+    gl.disableVertexAttribArray(0);
+    const uniform = this.use(this.shading, splats, sets);
+    gl.uniform1i(uniform("splats"), 0);
+    gl.uniform1i(uniform("sets"), 1);
+    gl.uniform3fv(uniform("place"), this.camera.place);
+    gl.uniform1i(uniform("degree"), level.shaded ? level.degree : 0);
+    gl.uniform4fv(uniform("colors"), level.colors);
+    if (level.shaded) gl.uniform4fv(uniform("rest"), level.rest);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+
+  /** Use a program with textures, and return where a uniform of it is. */
+  use(program, ...textures) {
+    const gl = this.gl;
+    gl.useProgram(program);
+    textures.forEach((texture, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    gl.activeTexture(gl.TEXTURE0);
+    return (name) => gl.getUniformLocation(program, name);
   }
 
   listen() {
     const canvas = this.canvas, fingers = new Map();
     addEventListener("resize", () => this.later());
+    const lost = new Error("the graphics card lost it; load the page again");
+    canvas.addEventListener("webglcontextlost", () => fail(lost));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
@@ -266,8 +501,15 @@ class Viewer {
     const focal = this.focal / (this.canvas.width / this.canvas.clientWidth);
     if (other) {
       const apart = (each) => Math.hypot(each.clientX - other.clientX, each.clientY - other.clientY);
-      this.camera.zoom(Math.max(apart(before), 1) / Math.max(apart(now), 1));
-      this.camera.move(x / 2, y / 2, focal);
+      const factor = Math.max(apart(before), 1) / Math.max(apart(now), 1);
+      this.camera.zoom(factor);
+      // What is between the fingers stays there, at the depth of the target.
+      const middle = (a, b, size) => (a + b) / 2 - size / 2;
+      const [across, down] = [
+        middle(before.clientX, other.clientX, this.canvas.clientWidth),
+        middle(before.clientY, other.clientY, this.canvas.clientHeight),
+      ];
+      this.camera.move(x / 2 + across * (1 - 1 / factor), y / 2 + down * (1 - 1 / factor), focal);
     } else if (now.buttons & 2 || now.shiftKey) {
       this.camera.move(x, y, focal);
     } else {
@@ -290,16 +532,52 @@ class Viewer {
 }
 
 const words = document.getElementById("words"), again = document.querySelector("button");
-clearInterval(loading);
-state.textContent = "Preparing the scene";
-// A task after the next frame: preparing takes seconds on a phone, which should show that it does.
-requestAnimationFrame(() => setTimeout(() => {
-  try {
-    const [bytes, count] = decode(document.getElementById("splats").textContent);
-    new Viewer(document.querySelector("canvas"), bytes, count, START);
+const state = document.getElementById("state"), bar = document.querySelector("progress");
+let [viewer, failed, unpacked, taken] = [null, false, 0, Promise.resolve()];
+
+function fail(error) {
+  failed = true;
+  clearInterval(loading);
+  bar.hidden = true;
+  state.hidden = false;
+  state.textContent = `The scene cannot be shown: ${error.message}`;
+}
+
+/** Show how much of the page is here: over a network it may take minutes. */
+function progress() {
+  let here = unpacked;
+  for (const part of document.querySelectorAll("script.part")) here += part.firstChild?.length ?? 0;
+  bar.value = here / Math.max(bar.dataset.characters, 1);
+  state.textContent = `Loading the scene: ${Math.floor(100 * bar.value)} %`;
+}
+const loading = setInterval(progress, 100);
+
+/** Unpack the part that the page has before this script, when all before it are. */
+function arrived() {
+  const part = document.currentScript.previousElementSibling;
+  taken = taken.then(async () => {
+    if (failed) return;
+    const bytes = await unpack(part.textContent);
+    unpacked += part.textContent.length;
+    part.remove();
+    viewer.take(bytes);
     state.hidden = true;
     words.hidden = again.hidden = false;
-  } catch (error) {
-    state.textContent = `The scene cannot be shown: ${error.message}`;
-  }
-}));
+  }).catch(fail);
+}
+
+function finished() {
+  taken.then(() => {
+    if (failed) return;
+    clearInterval(loading);
+    bar.hidden = state.hidden = true;
+    viewer.complete = true;
+    viewer.later();
+  });
+}
+
+try {
+  viewer = new Viewer(document.querySelector("canvas"), START);
+} catch (error) {
+  fail(error);
+}
