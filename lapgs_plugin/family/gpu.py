@@ -89,7 +89,8 @@ class _Call:
         like = inputs.means
         self.background = _beside(settings.bg, like).contiguous()
         view, full, centre = settings.viewmatrix, settings.projmatrix, settings.campos
-        self._matrices = _beside(view, like), _beside(full, like), _beside(centre, like)
+        # Scripts cut the centre out of an inverse: where it lies, only Triton's own launch would start the kernel.
+        self._matrices = _beside(view, like), _beside(full, like), aligned(_beside(centre, like))
         self._tangents = settings.tanfovx, settings.tanfovy
 
     @cached_property

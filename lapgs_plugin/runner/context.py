@@ -28,6 +28,7 @@ from lapgs_plugin.runner.archived_values import ADAPTER_MENDS, NO_RESIDUALS, exp
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
+from lapgs_plugin.runner.late_scalars import LateScalars
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.settings import RunSettings
@@ -77,12 +78,13 @@ class CheckoutContext:
     Attributes:
         images: photos of the scene.
         stages: hold the running stage, or that of the dry run.
+        scalars: write what the loop logs for TensorBoard.
         began: file-system time (ns) just before the main block.
     """
 
     def __init__(self, request: RunRequest) -> None:
         self.request, self.adapter, self.device = request, request.adapter, torch.device(request.device)
-        self.images, self.stages = SceneImages(), Stages()
+        self.images, self.stages, self.scalars = SceneImages(), Stages(), LateScalars()
         self.parts = IterationParts(self.stages, request.measuring.breakdown)
         rows = VisibleRows() if request.settings.run_ahead else None
         ours = {} if request.compiled is None else request.compiled.beside

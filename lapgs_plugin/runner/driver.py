@@ -68,6 +68,7 @@ class HierarchyDriver:
         with (
             Attachment(self._replacements.in_training()),
             counting_steps(profile, lambda: self._context.stages.running),
+            self._context.scalars.written(),
         ):
             with prepare(self._context, call) as run:
                 returned = _train_run(run)

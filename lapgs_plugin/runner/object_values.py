@@ -41,8 +41,8 @@ def matrix_keys(matrix: Any) -> tuple[bytes, bytes]:
 
 def size_of(settings: Any) -> tuple[int, ...]:
     """Return (height, width) of the view, empty if the settings do not say it."""
-    fields = fields_of(settings)
-    return tuple(int(fields[name]) for name in ("image_height", "image_width") if name in fields)
+    sides = getattr(settings, "image_height", None), getattr(settings, "image_width", None)
+    return tuple(int(side) for side in sides if side is not None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,16 +117,22 @@ def _image_key(outputs: Any, size: tuple[int, ...]) -> Any:
     """
     if isinstance(outputs, Tensor):
         return None
-    shapes = {p: tuple(v.shape) for p, v in _items(outputs) if isinstance(v, Tensor) and v.is_floating_point()}
-    maps = {p: s for p, s in shapes.items() if 3 <= len(s) <= 4 and all(length == 1 for length in s[:-3])}
-    for key, shape in maps.items():
+    shapes, more = [], []
+    for key, value in _items(outputs):
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            continue
+        shape = tuple(value.shape)
+        shapes.append(shape)
+        if not 3 <= len(shape) <= 4 or any(length != 1 for length in shape[:-3]):
+            continue
         first, last = shape[-3] == 3 and shape[-2:] == size, shape[-1] == 3 and shape[-3:-1] == size
         if first or last or (not size and 3 in (shape[-3], shape[-1])):
             return key
-    for key, shape in maps.items():
         if shape[-3] > 3 and shape[-2:] == size:
-            return key
-    returned = ", ".join(map(str, shapes.values())) or "no tensor"
+            more.append(key)
+    if more:
+        return more[0]
+    returned = ", ".join(map(str, shapes)) or "no tensor"
     raise UserInputError(
         f"the checkout's rasterizer returns {returned}, expected an image (3, h, w)"
         f"{' of ' + 'x'.join(map(str, size[::-1])) if size else ''}; `lapgs run --off` runs the script as it is"

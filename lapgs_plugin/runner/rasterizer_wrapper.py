@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -100,7 +100,7 @@ class RasterizerWrapper:
             location, by_mask = outer.location, False
             if outer.way is None:
                 caller = sys._getframe(1)
-                location = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
+                location = f"{_file_name(caller.f_code.co_filename)}:{caller.f_lineno}"
                 by_mask = rows is not None and rows.is_for_masks(caller.f_code)
             self.running = _RendererCall(way, key, location, (*outer.values, *values), by_mask)
             try:
@@ -217,6 +217,11 @@ class RasterizerWrapper:
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+@cache
+def _file_name(path: str) -> str:
+    return Path(path).name
 
 
 def _takes_parts(rasterizer: Any) -> bool:

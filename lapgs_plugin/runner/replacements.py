@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Callable
 from functools import wraps
@@ -10,6 +11,8 @@ from typing import Any
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
+from lapgs_plugin.checkouts.rewriting import tree_of
+from lapgs_plugin.checkouts.syntax import called_methods, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_rotations, checkout_ssim
@@ -71,6 +74,7 @@ class StageReplacements:
             *adapter.replacements(self._in_residual),
             *self._in_scores(profile),
             *self._in_losses(profile),
+            *self._in_reports(profile),
             *self._in_rotations(profile),
             *parts.replacements(profile, adapter.info),
         ]
@@ -126,6 +130,15 @@ class StageReplacements:
             return []
         holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
         return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
+
+    def _in_reports(self, profile: Profile) -> list[Replacement]:
+        """Return replacements of TensorBoard's writers, and of functions that read numbers for them."""
+        if self._context.wrapper.rows is None:
+            return []
+        script, called = profile.script.module, called_names(ast.walk(profile.source.training))
+        names = [name for name in dict.fromkeys(called) if _logs_scalars(vars(script).get(name))]
+        reports = [Replacement(script, name, reading_late, "training() when it reports") for name in names]
+        return [*reports, *self._context.scalars.replacements()]
 
     @staticmethod
     def _in_rotations(profile: Profile) -> list[Replacement]:
@@ -205,6 +218,12 @@ class StageReplacements:
             return None
 
         return reset_opacity
+
+
+def _logs_scalars(function: Any) -> bool:
+    """Return whether a value of a script is a function that gives numbers to a TensorBoard writer."""
+    tree = tree_of(function)
+    return tree is not None and "add_scalar" in called_methods(ast.walk(tree))
 
 
 def _without_size_limit(original: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from tests.contract.stub_runs import (
     STUBS,
     STUBS_AND_KINDS,
     composed_psnr,
+    edited_graphdeco,
     run_hierarchy,
 )
 
@@ -95,6 +97,42 @@ def test_running_ahead(name: str, kind: str, scene: Path, tmp_path: Path, monkey
         results.append((result.losses, [torch.cat([field.means, field.sh.flatten(1)], 1) for field in fields]))
     assert results[0][0] == results[1][0]
     assert all(map(torch.equal, results[0][1], results[1][1]))
+
+
+REPORT = '    """Quality of test views and some training views."""\n'
+WRITES = """
+    tb_writer.add_scalar("l1", Ll1.item(), iteration)
+    tb_writer.add_scalar("loss", loss.item(), iteration)
+    tb_writer.add_scalar("iter_time", elapsed, iteration)
+"""
+
+
+def test_what_tensorboard_gets(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report's numbers are read late, and the files have the same values in the same order."""
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    late: list[torch.Tensor] = []
+
+    def read(tensor: torch.Tensor) -> Any:
+        late.append(tensor)
+        return late_numbers.read(tensor)
+
+    monkeypatch.setitem(late_numbers.NAMES, READ, read)
+    script, contents = edited_graphdeco(tmp_path / "fork", "train.py", REPORT, REPORT + WRITES), []
+    stub = replace(STUBS["graphdeco"], name=str(script.parent))
+    for on in (True, False):
+        late.clear()
+        folder = tmp_path / str(on)
+        run_hierarchy(stub, scene, folder, *SHORT, hierarchy="laplacian", run_ahead=on)
+        assert len(late) == (3 * SHORT[1] if on else 0)  # with that of the progress bar
+        files = sorted(folder.rglob("events.*"))
+        assert len(files) == 2
+        events = [event for file in files for event in list(EventFileLoader(str(file)).Load())[1:]]
+        values = [(event.step, event.summary.value[0]) for event in events]
+        contents.append([(step, value.tag, value.tag != "iter_time" and value) for step, value in values])
+    assert len(contents[0]) == 3 * SHORT[1]
+    assert contents[0] == contents[1]
 
 
 @pytest.mark.parametrize("name", [*STUBS, *FORKS])

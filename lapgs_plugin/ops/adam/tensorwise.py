@@ -47,19 +47,29 @@ def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[s
         state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
     rate = float(group["lr"])  # some scripts set rates of NumPy's types
     betas, eps, mean, square = group["betas"], group["eps"], state["exp_avg"], state["exp_avg_sq"]
-    tensors = values, gradient, mean, square
     # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
-    alike = all(tensor.is_contiguous() and tensor.shape == values.shape for tensor in tensors)
-    if alike and values.numel() > 0 and triton_works(*tensors):
+    if _are_alike(values, gradient, mean, square) and values.numel() > 0 and triton_works(values):
         from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
 
-        state["step"] += 1
-        step_tensor_triton(AdamSlot(*tensors, float(state["step"]), rate, rate), betas, eps)
+        count = float(state["step"]) + 1.0
+        state["step"].fill_(count)  # takes a quarter of the time of adding one
+        step_tensor_triton(AdamSlot(values, gradient, mean, square, count, rate, rate), betas, eps)
         return
     adam(
         [values], [gradient], [mean], [square], [], [state["step"]], foreach=False, amsgrad=False, maximize=False,
         weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=eps,
     )  # fmt: skip
+
+
+def _are_alike(first: Tensor, *others: Tensor) -> bool:
+    """Return whether tensors are contiguous and of one shape, type and device."""
+    shape, dtype, device = first.shape, first.dtype, first.device
+    for tensor in others:
+        if tensor.shape != shape or tensor.dtype is not dtype or tensor.device != device:
+            return False
+        if not tensor.is_contiguous():
+            return False
+    return first.is_contiguous()
 
 
 def fuse_steps(optimizer: torch.optim.Optimizer) -> None:

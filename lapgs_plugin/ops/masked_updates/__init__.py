@@ -24,7 +24,7 @@ def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
     """
     if not _is_mask(mask) or not all(_fits(update, mask) for update in updates) or not _independent(mask, updates):
         return False
-    if triton_works(*(update.target for update in updates)):
+    if triton_works(updates[0].target):  # the others are alike
         from lapgs_plugin.ops.masked_updates.in_triton import update_rows_triton
 
         update_rows_triton(mask, updates)
@@ -39,7 +39,7 @@ def _is_mask(mask: Any) -> bool:
 
 
 def _fits(update: Update, mask: Tensor) -> bool:
-    target, source, n = update.target, update.source, len(mask)
+    target, source, n = update.target, update.source, mask.shape[0]
     if not _is_readable(target, mask) or target.dtype is not torch.float32 or target.shape not in ((n,), (n, 1)):
         return False
     if update.factor is not None and not _is_like(update.factor, target):

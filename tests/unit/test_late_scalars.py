@@ -1,0 +1,125 @@
+"""Numbers that a loop logs for TensorBoard, written late, against PyTorch's writer as it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lapgs_plugin.checkouts.attachment import Attachment
+from lapgs_plugin.runner import late_scalars
+from lapgs_plugin.runner.late_numbers import LateNumber
+from lapgs_plugin.runner.late_scalars import LateScalars
+
+pytest.importorskip("tensorboard")
+
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+from torch.utils.tensorboard.writer import SummaryWriter
+
+
+@contextmanager
+def late() -> Iterator[None]:
+    scalars = LateScalars()
+    with Attachment(scalars.replacements()), scalars.written():
+        yield
+
+
+def events_of(folder: Path) -> list[list[Any]]:
+    """Return the events of each file of a folder, without the one by which a file begins."""
+    return [list(EventFileLoader(str(file)).Load())[1:] for file in sorted(folder.glob("events.*"))]
+
+
+def losses_of(folder: Path) -> list[tuple[int, float]]:
+    """Return the steps and values of a folder's one file."""
+    (events,) = events_of(folder)
+    return [(event.step, event.summary.value[0].tensor.float_val[0]) for event in events]
+
+
+def log(folder: Path, number: Callable[[float], Any]) -> None:
+    """Log numbers, tensors and a histogram, with and without steps and times."""
+    writer, changing = SummaryWriter(str(folder)), torch.zeros(1)
+    for step in range(250):
+        changing += 1.0 / 3.0
+        writer.add_scalar("number", number(step / 7), step, walltime=1000.0 + step)
+        writer.add_scalar("tensor", changing, torch.tensor(step))
+        writer.add_scalar("integer", scalar_value=step, global_step=step, new_style=True)
+        if step % 60 == 59:
+            writer.add_histogram("histogram", torch.arange(3.0), step)
+            writer.add_scalar("half", changing.bfloat16())
+    writer.close()
+    writer.add_scalar("another", number(0.5), 1)
+    writer.close()
+
+
+def test_files_have_the_same(tmp_path: Path) -> None:
+    log(tmp_path / "plain", float)
+    with late():
+        log(tmp_path / "late", lambda value: LateNumber(lambda: value))
+    contents = [
+        [
+            [(event.step, event.summary, event.wall_time < 2000 and event.wall_time) for event in events]
+            for events in events_of(tmp_path / name)
+        ]
+        for name in ("plain", "late")
+    ]
+    assert [len(events) for events in contents[0]] == [250 * 3 + 4 * 2, 1]
+    assert contents[0] == contents[1]
+
+
+def test_nothing_is_read_before_many_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(late_scalars, "MOST_WAITING", 10)
+    read, times = list[int](), list[float]()
+
+    def loss(step: int) -> Any:
+        return LateNumber(lambda: float(read.append(step) or step))  # type: ignore[func-returns-value]
+
+    with late():
+        writer = SummaryWriter(str(tmp_path))
+        for step in range(25):
+            times.append(time.time())
+            writer.add_scalar("loss", loss(step), step)
+            assert read == list(range((step + 1) // 10 * 10))
+        writer.flush()
+        assert read == list(range(25))
+        times.append(time.time())
+        writer.add_scalar("loss", loss(25), 25)
+        times.append(time.time())
+    assert losses_of(tmp_path) == [(step, float(step)) for step in range(26)]
+    (events,) = events_of(tmp_path)
+    assert all(times[i] <= event.wall_time <= times[i + 1] for i, event in enumerate(events))
+
+
+def log_and_raise(folders: Sequence[Path], number: Callable[[], float], error: BaseException) -> None:
+    """Log five numbers in each folder, close nothing, and raise an error."""
+    with late():
+        writers = [SummaryWriter(str(folder)) for folder in folders]
+        for step in range(5):
+            for writer in writers:
+                writer.add_scalar("loss", LateNumber(number), step)
+        raise error
+
+
+@pytest.mark.parametrize("error", [ValueError(), KeyboardInterrupt()])
+def test_nothing_is_lost(tmp_path: Path, error: BaseException) -> None:
+    folders = tmp_path / "a", tmp_path / "b"
+    add_scalar = SummaryWriter.add_scalar
+    with pytest.raises(type(error)):
+        log_and_raise(folders, lambda: 0.5, error)
+    assert SummaryWriter.add_scalar is add_scalar
+    for folder in folders:
+        assert losses_of(folder) == [(step, 0.5) for step in range(5)]
+
+
+def test_an_error_of_the_gpu_is_seen(tmp_path: Path) -> None:
+    """And not the one of reading numbers after it."""
+
+    def fail() -> float:
+        raise RuntimeError("CUDA error: the second")
+
+    with pytest.raises(RuntimeError, match="the first"):
+        log_and_raise([tmp_path], fail, RuntimeError("CUDA error: the first"))
