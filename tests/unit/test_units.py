@@ -200,7 +200,7 @@ def test_what_cameras_look_at_does_not_depend_on_units(scale: float) -> None:
 
 
 def test_a_page_draws_from_the_near_plane_of_the_run(tmp_path: Path) -> None:
-    write_splat_page(blob_field(5), tmp_path / "a.html", "a", [ring_camera(0.0)], (0.0, 0.0, 0.0), 0.2 / 16)
+    write_splat_page([blob_field(5)], tmp_path / "a.html", "a", [ring_camera(0.0)], (0.0, 0.0, 0.0), 0.2 / 16)
     page = (tmp_path / "a.html").read_text()
     assert '"near": 0.0125' in page
     assert "NEAR = START.near" in page
