@@ -105,7 +105,7 @@ class StageDepth:
 
 def depth_weight(plan: StagePlan, stage: Stage, iteration: int) -> float:
     """Return the weight of the depth loss in an iteration of a stage, by the share of the supervised ones before it."""
-    supervised = [each for each in plan if not each.signed]
-    before = sum(each.iterations for each in supervised if each.level > stage.level)
-    progress = min(1.0, (before + iteration) / sum(each.iterations for each in supervised))
+    supervised = {planned.level: planned.iterations for planned in plan if not planned.signed}
+    before = sum(iterations for level, iterations in supervised.items() if level > stage.level)
+    progress = min(1.0, (before + iteration) / sum(supervised.values()))
     return FIRST_WEIGHT * math.exp(progress * math.log(LAST_WEIGHT / FIRST_WEIGHT))
