@@ -149,7 +149,14 @@ def difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def put_slider(page: Any, label: str, key: str) -> None:
     """Move a slider to its end by keyboard: "Home" for the minimum, "End" for the maximum."""
     name = page.get_by_text(label, exact=True).get_attribute("for")
-    page.locator(f'[id="{name}"] [role=slider]').press(key)
+    slider = page.locator(f'[id="{name}"] [role=slider]')
+    bound = slider.get_attribute("aria-valuemin" if key == "Home" else "aria-valuemax")
+    deadline = time.monotonic() + PATIENCE
+    slider.press(key)
+    while slider.get_attribute("aria-valuenow") != bound:  # a page may lose a key while another one closes
+        assert time.monotonic() < deadline, f"{label} stays at {slider.get_attribute('aria-valuenow')}"
+        time.sleep(0.2)
+        slider.press(key)
 
 
 def test_gain_level_orbit_and_divider(page: Any) -> None:
