@@ -10,12 +10,12 @@ import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from lapgs_bench.pareto.page import draw_charts
 from lapgs_plugin.reports.charts import Chart, Frame, Series, count_text, draw_lines
-from lapgs_plugin.reports.report import render_page
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA, IMAGE = ROOT / "docs/data/curves.csv", ROOT / "docs/images/curves.svg"
-TEMPLATE = Path(__file__).with_suffix(".svg.jinja")
+TITLE = "Quality over seconds of optimization, by scene and method"
 STYLES = {"one field": "variant-0", "nested": "variant-1", "laplacian": "variant-2"}
 METRICS = {"psnr_fit": "PSNR after fit", "lpips": "LPIPS"}
 COLUMNS = 3
@@ -29,7 +29,7 @@ def drawn(runs: Sequence[Run]) -> str:
     """Return the image: each metric's charts, one for each scene, in the order of the runs."""
     scenes = list(dict.fromkeys(run["scene"] for run in runs))
     charts = [_chart([run for run in runs if run["scene"] == scene], metric) for metric in METRICS for scene in scenes]
-    return render_page(TEMPLATE, charts=charts, styles=STYLES, columns=COLUMNS)
+    return draw_charts(charts, STYLES, TITLE, TITLE, COLUMNS)
 
 
 def runs_of_data() -> Sequence[Run]:
@@ -44,7 +44,7 @@ def _chart(runs: Sequence[Run], metric: str) -> Chart:
         for method, style in STYLES.items()
     ]
     megapixels = float(runs[0]["width"]) * float(runs[0]["height"]) / 1e6
-    title = f"{runs[0]['scene']}, {megapixels:.1f} megapixels: {METRICS[metric]}"
+    title = f"{runs[0]['scene']}, {megapixels:.1f} MP: {METRICS[metric]}"
     return draw_lines(title, "seconds", lines, from_zero=False, text=count_text, frame=SMALL)
 
 

@@ -20,7 +20,7 @@ from lapgs_bench.pareto.curves import (
 )
 from lapgs_bench.pareto.methods import ONE_FIELD
 from lapgs_plugin.files import write_text
-from lapgs_plugin.reports.charts import WHOLE, Chart, Series, count_text, draw_lines, seconds_text
+from lapgs_plugin.reports.charts import Chart, Series, count_text, draw_lines, seconds_text
 from lapgs_plugin.reports.report import render_page
 
 HTML, SVG, CSV = "pareto.html", "pareto.svg", "pareto.csv"
@@ -151,6 +151,19 @@ def _places(points: Sequence[Point], metric: Metric) -> list[tuple[float, float]
     return sorted((point.seconds, point.values[metric.key]) for point in points)
 
 
+def draw_charts(charts: Sequence[Chart], styles: Mapping[str, str], label: str, title: str, columns: int) -> str:
+    """Return an SVG image of charts, row by row.
+
+    Args:
+        charts: of one size.
+        styles: of lines, by what they stand for.
+        label: says what the image shows.
+        title: written above.
+        columns: charts beside each other.
+    """
+    return render_page(SVG_TEMPLATE, charts=charts, styles=styles, label=label, title=title, columns=columns)
+
+
 def write_results(curves: Curves, folder: Path) -> None:
     """Write the page, the SVG and the CSV file.
 
@@ -162,9 +175,9 @@ def write_results(curves: Curves, folder: Path) -> None:
     rows = [{**row, "front": fronts[row["method"], row["budget"]]} for row in curves.rows]
     write_csv(folder / CSV, rows)
     charts = [curves.chart(metric) for metric in curves.metrics]
-    write_text(
-        folder / SVG, render_page(SVG_TEMPLATE, scene=curves.scene, charts=charts, styles=curves.styles, frame=WHOLE)
-    )
+    label = f"Quality over seconds: {curves.scene}"
+    title = f"{label}; rings: the Pareto front"
+    write_text(folder / SVG, draw_charts(charts, curves.styles, label, title, columns=2))
     page = render_page(
         PAGE_TEMPLATE,
         scene=curves.scene,
