@@ -39,7 +39,8 @@ class SelfCheck:
     def passes_on(self, device: torch.device) -> bool:
         """Run the comparison now."""
         try:
-            with torch.inference_mode(False), torch.enable_grad():  # whatever mode the caller is in
+            # Whatever mode the caller is in, and whichever device it lets new tensors be on.
+            with torch.inference_mode(False), torch.enable_grad(), torch.device("cpu"):
                 difference = self.difference(device)
         except ImportError as error:  # Triton comes with PyTorch for CUDA on Linux only
             logger.info("%s: %s", self._fallback, _in_one_line(error))

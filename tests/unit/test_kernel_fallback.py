@@ -162,3 +162,10 @@ def test_a_kernel_of_rendering(name: str, caplog: pytest.LogCaptureFixture) -> N
     torch.testing.assert_close(result, expected, rtol=0, atol=1e-6)
     line = said(caplog)[0]
     assert line.startswith("rendering by `gsplat.rasterization`, which takes longer: module 'triton.language' has")
+
+
+def test_a_check_draws_its_numbers_on_the_cpu_whichever_device_is_the_default() -> None:
+    with torch.device("meta"):
+        assert SelfCheck(lambda device: float(torch.zeros(1).to(device).sum()), "unused", 0.0).passes_on(
+            torch.device("cpu")
+        )
