@@ -1,12 +1,12 @@
-"""Step the tensors of a script's own `torch.optim.Adam` in one of our kernels each.
+"""Step the tensors of a script's own `torch.optim.Adam` in one of our kernels.
 
-PyTorch's fused Adam has such kernels, too. But its blocks take so many numbers that a field's positions leave most of a
-GPU idle, and its Python takes as long as a small render.
+PyTorch's fused Adam has one for each group of parameters, because it takes one rate. Its blocks take so many numbers
+that a field's positions leave most of a GPU idle, and its Python takes as long as a small render.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -31,34 +31,46 @@ class TensorwiseAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        slots: dict[tuple[Any, ...], list[AdamSlot]] = {}  # of tensors that one launch can step
         for group in self.param_groups:
             for values in group["params"]:
-                if values.grad is not None:
-                    _step(values, values.grad, self.state[values], group)
+                if values.grad is None:
+                    continue
+                slot = _slot(values, values.grad, self.state[values], group)
+                if slot is not None:
+                    slots.setdefault((*group["betas"], group["eps"], values.device), []).append(slot)
+        for (beta1, beta2, eps, _), together in slots.items():
+            _step_together(together, (beta1, beta2), eps)
         return loss
 
     step.hooked = True  # type: ignore[attr-defined]  # as PyTorch marks it, which else calls hooks twice
 
 
-def _step(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    """Step a tensor in place."""
+def _slot(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[str, Any]) -> AdamSlot | None:
+    """Count a step of a tensor and return its inputs; None if it was stepped in PyTorch's operations."""
     if not state:  # on the processor, as PyTorch's own counts: a GPU does not have to be asked for it
         state["step"] = torch.tensor(0.0)
         state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
     rate = float(group["lr"])  # some scripts set rates of NumPy's types
-    betas, eps, mean, square = group["betas"], group["eps"], state["exp_avg"], state["exp_avg_sq"]
+    mean, square = state["exp_avg"], state["exp_avg_sq"]
     # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
     if _are_alike(values, gradient, mean, square) and values.numel() > 0 and triton_works(values):
-        from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
-
         count = float(state["step"]) + 1.0
         state["step"].fill_(count)  # takes a quarter of the time of adding one
-        step_tensor_triton(AdamSlot(values, gradient, mean, square, count, rate, rate), betas, eps)
-        return
+        return AdamSlot(values, gradient, mean, square, count, rate, rate)
+    betas = group["betas"]
     adam(
         [values], [gradient], [mean], [square], [], [state["step"]], foreach=False, amsgrad=False, maximize=False,
-        weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=eps,
+        weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=group["eps"],
     )  # fmt: skip
+    return None
+
+
+def _step_together(slots: Sequence[AdamSlot], betas: tuple[float, float], eps: float) -> None:
+    from lapgs_plugin.ops.adam.in_triton import MOST_TENSORS, step_tensors_triton
+
+    for start in range(0, len(slots), MOST_TENSORS):
+        step_tensors_triton(slots[start : start + MOST_TENSORS], betas, eps)
 
 
 def _are_alike(first: Tensor, *others: Tensor) -> bool:
@@ -97,16 +109,22 @@ def _is_plain(group: dict[str, Any]) -> bool:
 
 @matches_reference("PyTorch's fused Adam instead of ours", 1e-5)
 def triton_works(device: torch.device) -> float:
-    """Compare three steps of more numbers than a program takes, relative to how far they moved."""
-    from lapgs_plugin.ops.adam.in_triton import step_tensor_triton
-
+    """Compare three steps of more tensors than a launch takes, relative to how far they moved."""
     generator = torch.Generator().manual_seed(0)
-    start = torch.randn(700, 3, generator=generator).to(device)
-    reference = torch.nn.Parameter(start.clone())
-    optimizer = torch.optim.Adam([reference], lr=0.1, eps=ADAM_EPS)
-    values, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+    starts = [torch.randn(size, 3, generator=generator).to(device) for size in (700, 1, 171, 512, 170, 341, 700)]
+    references = [torch.nn.Parameter(start.clone()) for start in starts]
+    rates = [0.1 * i for i in range(1, len(starts) + 1)]
+    groups = [{"params": [one], "lr": rate} for one, rate in zip(references, rates, strict=True)]
+    optimizer = torch.optim.Adam(groups, eps=ADAM_EPS)
+    states = [(start.clone(), torch.zeros_like(start), torch.zeros_like(start)) for start in starts]
     for count in range(1, 4):
-        reference.grad = torch.randn(start.shape, generator=generator).to(device)
+        slots = []
+        for reference, (values, mean, square), rate in zip(references, states, rates, strict=True):
+            reference.grad = torch.randn(values.shape, generator=generator).to(device)
+            slots.append(AdamSlot(values, reference.grad, mean, square, count, rate, rate))
         optimizer.step()
-        step_tensor_triton(AdamSlot(values, reference.grad, mean, square, count, 0.1, 0.1), BETAS, ADAM_EPS)
-    return largest([(values - reference).abs() / (reference.detach() - start).abs().max()])
+        _step_together(slots, BETAS, ADAM_EPS)
+    return largest(
+        (values - reference).abs() / (reference.detach() - start).abs().max()
+        for (values, _, _), reference, start in zip(states, references, starts, strict=True)
+    )
