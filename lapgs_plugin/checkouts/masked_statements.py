@@ -17,7 +17,7 @@ from collections.abc import Collection, Mapping
 from itertools import groupby
 from typing import NamedTuple
 
-from lapgs_plugin.checkouts.rewriting import Change, call
+from lapgs_plugin.checkouts.rewriting import STATEMENTS, Change, call
 
 UPDATE = "_lapgs_update"
 """Name of the function that updates the rows, and returns whether it did."""
@@ -27,8 +27,6 @@ KEY = "visibility_filter"
 """Name of the mask, or of its indices, in the results of the family's renderers."""
 LARGEST = ("max", "maximum")
 """Functions of torch that return the larger one of two tensors' elements."""
-STATEMENTS = ("body", "orelse", "finalbody")
-"""Names of lists of statements in the nodes of a tree."""
 
 
 class _Update(NamedTuple):

@@ -20,6 +20,9 @@ FACTORY = "_lapgs_recompiled"
 RECOMPILATION = "_lapgs_recompilation"
 """Attribute of recompiled functions: their `_Recompilation`."""
 
+STATEMENTS = ("body", "orelse", "finalbody")
+"""Names of lists of statements in the nodes of a tree."""
+
 FUTURE = reduce(lambda flags, name: flags | getattr(__future__, name).compiler_flag, __future__.all_feature_names, 0)
 """Flags of all future statements."""
 

@@ -15,7 +15,7 @@ from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.checkouts.syntax import called_methods, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import checkout_rotations, checkout_ssim
+from lapgs_plugin.runner import checkout_loss, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
@@ -128,8 +128,8 @@ class StageReplacements:
         """Return replacements of the checkout's SSIM by ours, if the settings ask for it."""
         if not self._context.request.settings.fused_ssim:
             return []
-        holders = [holder for holder in profile.named([checkout_ssim.NAME]) if inspect.isfunction(getattr(*holder))]
-        return [Replacement(*holder, checkout_ssim.in_our_kernels, "training() in its loss") for holder in holders]
+        holders = [holder for holder in profile.named([checkout_loss.NAME]) if inspect.isfunction(getattr(*holder))]
+        return [Replacement(*holder, checkout_loss.in_our_kernels, "training() in its loss") for holder in holders]
 
     def _in_reports(self, profile: Profile) -> list[Replacement]:
         """Return replacements of TensorBoard's writers, and of functions that read numbers for them."""
@@ -150,11 +150,13 @@ class StageReplacements:
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
         rows = self._context.wrapper.rows
-        ahead = original if rows is None else rows.updating(reading_late(original))
+        changed = original if rows is None else rows.updating(reading_late(original))
+        if self._context.request.settings.fused_ssim:
+            changed = checkout_loss.in_one_kernel(changed)
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:
-            return self._train(TrainingCall.bind(ahead, args, kwargs))
+            return self._train(TrainingCall.bind(changed, args, kwargs))
 
         return training
 

@@ -14,7 +14,7 @@ from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.ops.adam import tensorwise
 from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
 from lapgs_plugin.ops.masked_updates import update_rows
-from lapgs_plugin.runner import checkout_ssim, late_numbers, visible_rows
+from lapgs_plugin.runner import checkout_loss, late_numbers, visible_rows
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.stage_model import StageModel
 from lapgs_plugin.runner.stage_rendering import StageRendering
@@ -59,13 +59,13 @@ def test_adam(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("kind", KINDS)
 def test_ssim(scene: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[torch.Size] = []
-    ours = checkout_ssim._our_ssim
+    ours = checkout_loss._our_ssim
 
     def counted(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         called.append(image.shape)
         return ours(image, other)
 
-    monkeypatch.setattr(checkout_ssim, "_our_ssim", counted)
+    monkeypatch.setattr(checkout_loss, "_our_ssim", counted)
     values = []
     for on in (True, False):
         called.clear()

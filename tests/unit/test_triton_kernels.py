@@ -20,7 +20,7 @@ from tests.gaussian_records import records_of
 from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
-from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
+from lapgs_plugin.ops.photometric_loss.in_triton import loss_and_l1_triton, photometric_loss_triton
 from lapgs_plugin.ops.upsample import upsample_add
 from lapgs_plugin.ops.densification_statistics.in_triton import add_statistics_triton
 
@@ -140,6 +140,17 @@ expected = torch.stack([photometric_loss_torch(*part, 0.2) for part in parts]).m
 close(loss.double(), expected)
 (by_views,) = torch.autograd.grad(3 * expected, exact)
 close((gradient * gradient.numel()).double(), by_views * gradient.numel(), 1e-4)  # values to 16; worst seen 4.5e-6
+for shape in ((3, 18, 5), (2, 3, 70, 41)):
+    prediction, target = torch.rand(shape).requires_grad_(), torch.rand(shape)
+    values = loss_and_l1_triton(prediction, target, 0.2)
+    exact = prediction.double()
+    expected = photometric_loss_torch(exact, target.double(), 0.2), (exact - target).abs().mean()
+    for one, other in zip(values, expected, strict=True):
+        close(one.double(), other)
+    for factors in ((3.0, 0.0), (0.0, 2.0), (1.0, 2.0)):
+        sums = [sum(f * value for f, value in zip(factors, each, strict=True) if f) for each in (values, expected)]
+        one, other = (torch.autograd.grad(value, prediction, retain_graph=True)[0] for value in sums)
+        close(one * one.numel(), other * one.numel(), 1e-4)
 broken = prediction.detach().clone()[0, :, :18, :5]
 broken[1, 0, 0] = torch.nan
 assert photometric_loss_triton(broken, stored, 0.2).isnan()
@@ -153,6 +164,23 @@ torch.set_default_device(None)
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
 assert tensorwise.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 8e-7
+# As many tensors as a fork has, of which one launch takes six; one group has other betas.
+parameters = [torch.nn.Parameter(torch.randn(size, 3).to(DEVICE)) for size in (600, 1, 300, 0, 171, 513, 90, 700)]
+groups = [{"params": [one], "lr": 0.1 * i} for i, one in enumerate(parameters, start=1)]
+groups[2]["betas"] = 0.5, 0.9
+others = [torch.nn.Parameter(one.detach().clone()) for one in parameters]
+optimizer = torch.optim.Adam(groups, eps=1e-15)
+reference = torch.optim.Adam([{**group, "params": [other]} for group, other in zip(groups, others, strict=True)])
+works, tensorwise.triton_works = tensorwise.triton_works, lambda *tensors: True
+tensorwise.fuse_steps(optimizer)
+for _ in range(3):
+    for one, other in zip(parameters, others, strict=True):
+        one.grad = other.grad = torch.randn(one.shape).to(DEVICE)
+    optimizer.step()
+    reference.step()
+for one, other in zip(parameters, others, strict=True):
+    close(one, other, 1e-5)  # numbers to 4, moved by 2
+tensorwise.triton_works = works
 assert rows.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 3e-5

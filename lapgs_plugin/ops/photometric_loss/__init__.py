@@ -56,6 +56,23 @@ def photometric_loss(
     return photometric_loss_torch(prediction, target, ssim_weight, fused or ssim)
 
 
+def loss_and_l1(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
+    """Return `photometric_loss` and L1 alone, the mean absolute difference, both differentiable by the prediction.
+
+    Where Triton works, both come from one kernel.
+
+    Args:
+        prediction: (3, h, w) or (b, 3, h, w), float32.
+        target: of that shape, float32, without gradient.
+        ssim_weight: lambda, in [0, 1].
+    """
+    if triton_works(prediction, target):
+        from lapgs_plugin.ops.photometric_loss.in_triton import loss_and_l1_triton
+
+        return loss_and_l1_triton(prediction, target, ssim_weight)
+    return photometric_loss(prediction, target, ssim_weight), (prediction - target).abs().mean()
+
+
 def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     """Return SSIM of each pixel and channel of float32 images (b, c, h, w), differentiable by the prediction.
 

@@ -80,15 +80,36 @@ def _ssim(
     return ssim, slope, -ssim * of_variances, 2.0 * luminance * per
 
 
+@triton.jit
+def _with_l1(
+    loss: tl.tensor, distance: tl.tensor, difference: tl.tensor, counted: tl.tensor, l1_weight: float,
+    apart: tl.constexpr,
+) -> tl.tuple:  # fmt: skip
+    """Add a row's L1 to the loss, and to the sum of L1 alone if that is `apart`."""
+    if apart:
+        distance += tl.where(counted, 1.0, 0.0) * difference
+    return loss + tl.where(counted, l1_weight, 0.0) * difference, distance
+
+
+@triton.jit
+def _add(
+    total: tl.tensor, l1: tl.tensor, loss: tl.tensor, distance: tl.tensor, count: float, apart: tl.constexpr
+) -> None:
+    """Add a program's part to the loss, and to L1 of `count` values if that is `apart`."""
+    tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
+    if apart:
+        tl.atomic_add(l1, tl.sum(distance) / count)
+
+
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
     x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
-    values: tl.tensor, sizes: tl.tensor,
+    l1: tl.tensor, values: tl.tensor, sizes: tl.tensor,
     height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, mapped: tl.constexpr,
-    interleaved: tl.constexpr, mixed: tl.constexpr, window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr,
-    block: tl.constexpr,
+    apart: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr, window: tl.constexpr, radius: tl.constexpr,
+    colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the derivatives of SSIM by the local means of x, x squared and x y, and add to the loss.
 
@@ -96,6 +117,7 @@ def _loss_kernel(
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
         by_mean, by_square, by_product: with the strides of x.
         total: the loss; unused if `mapped`.
+        l1: L1 alone; unused unless `apart`, and with sizes that are not `mixed`.
         values: SSIM itself, with the strides of x; unused unless `mapped`.
         sizes: (b, 2) of the images' own parts if they are `mixed`; weights are then divided by their pixels here.
         scale: of y.
@@ -109,7 +131,7 @@ def _loss_kernel(
     out, inside = tl.join(at_x, at_x + x_column), tl.join(column < width, column + 1 < width)  # (block, 2)
     zero, zeros = tl.zeros((block,), tl.float32), tl.zeros((block, 2), tl.float32)
     sums_x = (zeros,) * (2 * radius)
-    sums_y, sums_square, sums_product, loss, row = sums_x, sums_x, sums_x, zeros, first - radius
+    sums_y, sums_square, sums_product, loss, distance, row = sums_x, sums_x, sums_x, zeros, zeros, first - radius
     while row < last + radius:  # `range` of a tensor cannot be interpreted
         limit = tl.where((row >= 0) & (row < height), width, 0)  # of the columns; none outside of the image
         x0, x1, y0, y1, square0, square1, product0, product1 = zero, zero, zero, zero, zero, zero, zero, zero
@@ -135,7 +157,9 @@ def _loss_kernel(
                 difference0 = tl.abs(one - other)
             if near == radius + 1:
                 difference1 = tl.abs(one - other)
-        loss += tl.where((row >= first) & (row < last), l1_weight, 0.0) * tl.join(difference0, difference1)
+        loss, distance = _with_l1(
+            loss, distance, tl.join(difference0, difference1), (row >= first) & (row < last), l1_weight, apart
+        )
         mean, sums_x = _shifted(sums_x, tl.join(x0, x1), window, radius)
         mean_y, sums_y = _shifted(sums_y, tl.join(y0, y1), window, radius)
         squares, sums_square = _shifted(sums_square, tl.join(square0, square1), window, radius)
@@ -151,7 +175,7 @@ def _loss_kernel(
                 tl.store(values + here, ssim, inside)
         row += 1
     if not mapped:
-        tl.atomic_add(total, tl.sum(loss))  # NaN stays NaN, which stops a diverged run
+        _add(total, l1, loss, distance, 1.0 * width * height * colors * tl.num_programs(2), apart)
 
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
@@ -210,28 +234,42 @@ def _gradient_kernel(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """Map (prediction, target, ssim_weight, sizes or None), images (b, 3, h, w), to the loss."""
+    """Map (prediction, target, ssim_weight, sizes or None, apart), images (b, 3, h, w), to the loss.
+
+    To (loss, L1) if `apart`, without sizes.
+    """
 
     @staticmethod
-    def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None) -> Tensor:
+    def forward(
+        ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None, apart: bool
+    ) -> Tensor | tuple[Tensor, Tensor]:
         total = torch.full((), ssim_weight, device=prediction.device)
+        l1 = torch.zeros_like(total) if apart else total
         assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
         maps = [torch.empty_like(prediction) for _ in range(3)]
         assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
         own = prediction if sizes is None else sizes_on_device(sizes, prediction.device)
         programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, total, total, own, *numbers, **constants,
-            **SSIM_CONSTANTS, mapped=False, **CONSTANTS,
+            _loss_kernel, programs, prediction, target, *maps, total, l1, total, own, *numbers, **constants,
+            **SSIM_CONSTANTS, mapped=False, apart=apart, **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         ctx.ssim_weight, ctx.own = ssim_weight, None if sizes is None else own
-        return total
+        ctx.set_materialize_grads(False)
+        return (total, l1) if apart else total
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(
+        ctx: Any, by_loss: Tensor | None, by_l1: Tensor | None = None
+    ) -> tuple[Tensor | None, None, None, None, None]:
         prediction, target, *maps = ctx.saved_tensors
+        by_distance = None
+        if by_l1 is not None:  # seldom: loops of the family only log it
+            by_distance = by_l1 / prediction.numel() * (prediction - target).sign()
+        if by_loss is None:
+            return by_distance, None, None, None, None
         mixed = ctx.own is not None
         gradient = torch.zeros_like(prediction) if mixed else torch.empty_like(prediction)
         programs, numbers, constants = _launch_of(prediction, target, ctx.ssim_weight, mixed=mixed)
@@ -239,7 +277,7 @@ class _PhotometricLoss(torch.autograd.Function):
             _gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, ctx.own if mixed else gradient,
             *numbers, **constants, **CONSTANTS,
         )  # fmt: skip
-        return gradient, None, None, None
+        return gradient if by_distance is None else gradient + by_distance, None, None, None, None
 
 
 class _SsimMap(torch.autograd.Function):
@@ -250,8 +288,8 @@ class _SsimMap(torch.autograd.Function):
         values, *maps = (torch.empty_like(prediction) for _ in range(4))
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, values, values, values, *numbers, **constants,
-            **SSIM_CONSTANTS, mapped=True, **CONSTANTS,
+            _loss_kernel, programs, prediction, target, *maps, values, values, values, values, *numbers, **constants,
+            **SSIM_CONSTANTS, mapped=True, apart=False, **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         return values
@@ -299,8 +337,16 @@ def photometric_loss_triton(
     """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
     image = _without_gaps(as_batch(prediction))
     options = as_batch(target), ssim_weight, sizes
-    loss: Tensor = _PhotometricLoss.apply(image, *options)  # type: ignore[no-untyped-call]  # torch's
+    loss: Tensor = _PhotometricLoss.apply(image, *options, False)  # type: ignore[no-untyped-call]  # torch's
     return loss
+
+
+def loss_and_l1_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
+    """Do `loss_and_l1` for float32 images on a CUDA device, of any strides."""
+    image = _without_gaps(as_batch(prediction))
+    options = as_batch(target), ssim_weight, None
+    values: tuple[Tensor, Tensor] = _PhotometricLoss.apply(image, *options, True)  # type: ignore[no-untyped-call]
+    return values
 
 
 def ssim_map_triton(prediction: Tensor, target: Tensor) -> Tensor:

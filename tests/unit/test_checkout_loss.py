@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from lapgs_plugin.runner.checkout_ssim import in_our_kernels
+from lapgs_plugin.runner.checkout_loss import in_our_kernels
 from tests.devices import DEVICES
 
 
