@@ -24,6 +24,7 @@ from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.rewriting import rewritten
+from lapgs_plugin.checkouts.screen_points import POINTS, ScreenPoints
 from lapgs_plugin.checkouts.whole_sh import SH, WHOLE, WholeSh, joined_attributes
 from lapgs_plugin.family.binding import Rasterizer
 from lapgs_plugin.family.call import ShParts
@@ -79,6 +80,7 @@ class RasterizerWrapper:
         self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
+        self._points: tuple[list[Any], Tensor, int] | None = None  # how they were asked for, and their version
         self._take_parts: dict[bool, bool] = {}  # by whether ours renders: whether the rasterizers take `ShParts`
         self._parts: dict[type, tuple[str, str] | None] = {}
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
@@ -89,6 +91,7 @@ class RasterizerWrapper:
         """Return the replacement of a function that renders a view."""
         rows = self.rows
         renderer = rewritten(original, WholeSh, {SH: self._sh})
+        renderer = rewritten(renderer, ScreenPoints, {POINTS: self._screen_points})
         renderer = renderer if rows is None else rows.in_renderer(renderer, lambda: self.running.by_mask)
 
         @wraps(original)
@@ -211,6 +214,24 @@ class RasterizerWrapper:
         if names is None or rendering is None or not self._take_parts.get(self.takes_ours) or not rendering.takes_parts:
             return getattr(model, WHOLE)
         return ShParts(getattr(model, names[0]), getattr(model, names[1]))
+
+    def _screen_points(self, make: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
+        """Return the zeros of a render whose gradients are those by projected centres, the same ones in each iteration.
+
+        They are a leaf, so that PyTorch adds nothing to them and does not copy their gradient.
+
+        Args:
+            make: PyTorch's function of zeros.
+            args, kwargs: of it.
+        """
+        if not torch.is_grad_enabled():
+            return make(*args, **kwargs) + 0
+        like = [(a.shape, a.dtype, a.device) if isinstance(a, Tensor) else a for a in args]
+        asked = [make, like, kwargs]
+        if self._points is None or self._points[0] != asked or self._points[1]._version != self._points[2]:
+            zeros = make(*args, **kwargs).detach()
+            self._points = asked, zeros, zeros._version
+        return self._points[1].detach().requires_grad_()
 
     def _zero_background(self, like: Tensor) -> Tensor:
         """Return (3,) zeros on the device of a background, the same ones in every call."""

@@ -1,0 +1,84 @@
+"""The tensor by which a renderer asks for gradients of projected centres, made as a leaf of kept zeros."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_plugin.checkouts.screen_points import ScreenPoints
+from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
+from lapgs_plugin.runner.running_stage import Stages
+
+RENDERER = """
+import torch
+
+def render(means):
+    points = torch.zeros({}, dtype=means.dtype, requires_grad=True, device="cpu") + 0
+    try:
+        points.retain_grad()
+    except:
+        pass
+    return points, (points[:, :2] * means[:, :2]).sum()
+"""
+
+
+@pytest.mark.parametrize("arguments", ["(len(means), 4)", "[len(means), 4]", "len(means), 4"])
+def test_gradients_are_the_same(load_module: Callable[[str], ModuleType], arguments: str) -> None:
+    source = RENDERER.format(arguments).replace("points[:, :2]", "columns(points)")
+    module = load_module(source + "\ndef columns(points):\n    return points[:, :2]\n")
+    ours = RasterizerWrapper(Stages()).renderer(module.render)
+    addresses = set()
+    for count in (5, 5, 7):
+        means = torch.rand(count, 3)
+        seen: list[Tensor] = []
+        for render in (ours, module.render, ours):
+            points, value = render(means)
+            assert points.shape == (count, 4)
+            assert not points.any()
+            value.backward()
+            seen.append(points.grad)
+            if render is ours:
+                assert points.is_leaf
+                addresses.add((count, points.data_ptr()))
+        assert torch.equal(seen[0], seen[1]), "and no sum over renders"
+        assert torch.equal(seen[2], seen[1])
+    assert len(addresses) == 2, "zeros are kept as long as the model keeps its size"
+    with torch.no_grad():
+        assert not ours(means)[0].requires_grad
+
+
+def test_zeros_that_were_written_are_made_again(load_module: Callable[[str], ModuleType]) -> None:
+    source = RENDERER.format("len(means), 4").replace("points[:, :2]", "points.sum()")
+    ours = RasterizerWrapper(Stages()).renderer(load_module(source).render)
+    for _ in range(3):
+        points, _ = ours(torch.rand(5, 3))
+        assert not points.any()
+        with torch.no_grad():
+            points.add_(1)
+
+
+@pytest.mark.parametrize(
+    ("lines", "changes"),
+    [
+        ("x = torch.zeros_like(m, requires_grad=True) + 0", 1),
+        ("x = torch.zeros_like(m, requires_grad=True)", 0),
+        ("x = torch.zeros_like(m) + 0", 0),
+        ("x = torch.ones_like(m, requires_grad=True) + 0", 0),
+        ("x = torch.zeros_like(m, requires_grad=True) + 1", 0),
+        ("x = torch.zeros_like(m, requires_grad=True) + 0\n    x[:, 0] = 1", 0),
+        ("x = torch.zeros_like(m, requires_grad=True) + 0\n    x += m", 0),
+        ("x = torch.zeros_like(m, requires_grad=True) + 0\n    x.add_(m)", 0),
+        ("x = torch.zeros_like(m, requires_grad=True) + 0\n    x.data.add_(m)", 0),
+    ],
+)
+def test_what_is_replaced(lines: str, changes: int) -> None:
+    tree: Any = ast.parse(f"def render(m):\n    {lines}").body[0]
+    change = ScreenPoints(tree)
+    change.visit(tree)
+    assert change.changes == changes
