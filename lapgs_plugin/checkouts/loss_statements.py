@@ -4,6 +4,7 @@
     loss = (1.0 - opt.lambda_dssim) * Ll1 + opt.lambda_dssim * (1.0 - ssim(image, gt_image))
 
 SSIM may be a variable, too, set by one function or by either of two: `if FUSED_SSIM_AVAILABLE: ... else: ...`.
+And where the gradient of a loss begins, `loss.backward()`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from lapgs_plugin.checkouts.rewriting import STATEMENTS, Change, call
 
 LOSSES = "_lapgs_losses"
 """Name of the function that returns L1 and the loss, or None if the statements have to be executed."""
+BACKWARD = "_lapgs_backward"
+"""Name of the function that takes the place of `loss.backward()`."""
 VALUES = "_lapgs_l1_and_loss"
 """Name of the variable of its result."""
 L1 = "_lapgs_l1"
@@ -60,6 +63,14 @@ class LossStatements(Change):
     def __init__(self, function: ast.FunctionDef) -> None:
         names = (node for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load))
         self._loads = Counter(node.id for node in names)
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+        """Return the statement, or a call of `BACKWARD`."""
+        match node.value:
+            case ast.Call(ast.Attribute(ast.Name() as loss, "backward"), [], []):
+                node.value = ast.copy_location(call(BACKWARD, loss), node.value)
+                self.changes += 1
+        return node
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         """Return the node with losses in the places of its statements."""

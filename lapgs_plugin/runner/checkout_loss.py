@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.checkouts.loss_statements import LOSSES, LossStatements
+from lapgs_plugin.checkouts.loss_statements import BACKWARD, LOSSES, LossStatements
 from lapgs_plugin.checkouts.rewriting import rewritten
 from lapgs_plugin.ops import photometric_loss
 from lapgs_plugin.ops.self_check import SelfCheck, largest
@@ -49,7 +49,20 @@ def in_our_kernels(original: Callable[..., Any]) -> Callable[..., Any]:
 
 def in_one_kernel(training: Callable[..., Any]) -> Callable[..., Any]:
     """Return a script's training function, changed so that L1 and SSIM of its loss come from one kernel."""
-    return rewritten(training, LossStatements, {LOSSES: _losses})
+    return rewritten(training, LossStatements, {LOSSES: _losses, BACKWARD: _backward})
+
+
+def _backward(loss: Any) -> None:
+    """Do `loss.backward()`, for which PyTorch would fill a new 1 in each iteration."""
+    if isinstance(loss, Tensor) and loss.ndim == 0 and loss.dtype == torch.float32:
+        loss.backward(_one(loss.device))  # type: ignore[no-untyped-call]  # torch's
+    else:
+        loss.backward()
+
+
+@cache
+def _one(device: torch.device) -> Tensor:
+    return torch.ones((), device=device)
 
 
 def _losses(l1: Any, ssim: Any, batched: bool, image: Any, target: Any, weight: Any) -> tuple[Tensor, Tensor] | None:

@@ -36,13 +36,13 @@ class RunSettings(HierarchySettings):
     )
     fused_adam: bool = option(
         True,
-        "Step the checkout's plain Adam optimizers in one kernel for each tensor.",
+        "Step all tensors of the checkout's plain Adam optimizers in one kernel.",
         panel=STORAGE,
         names=("--fused-adam/--no-fused-adam",),
     )
     fused_ssim: bool = option(
         True,
-        "Compute the checkout's SSIM in our kernels, where its function returns the same.",
+        "Compute the checkout's photometric loss, or its SSIM alone, in our kernels, where its functions return the same.",
         panel=STORAGE,
         names=("--fused-ssim/--no-fused-ssim",),
     )

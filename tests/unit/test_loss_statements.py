@@ -147,3 +147,16 @@ def test_a_weight_that_is_learned_gets_its_gradient(
     loss.backward()
     assert opt.weight.grad is not None
     assert not counted
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_gradients_begin_with_one(factor: float, load_module: Callable[[str], ModuleType]) -> None:
+    lines = L1, ONE, f"loss = loss * {factor}", "loss.backward()"
+    training = in_one_kernel(load_module(SCRIPT.format("\n    ".join(lines))).training)
+    image, gt = images(3, 21, 34)
+    for count in (1, 2):  # of the images' own sums
+        _, loss = training(image, gt, Options())
+        expected = photometric_loss.photometric_loss(image, gt, 0.2)
+        assert loss.item() == pytest.approx(factor * expected.item(), rel=1e-5)
+        gradient = count * factor * torch.autograd.grad(expected, image)[0]
+        torch.testing.assert_close(image.grad, gradient, rtol=1e-4, atol=1e-7)

@@ -25,6 +25,12 @@ BLOCK = 128
 LEAST_ROWS = 16
 """Fewest rows of a program, which reads ten more."""
 
+ZEROS = 256
+"""Zeros that are filled together."""
+ZERO_STEP = 4
+"""Numbers from one to the next: `launch` wants tensors that begin at multiples of 16 bytes."""
+_zeros: dict[tuple[torch.device, int], list[Tensor]] = {}  # that are left, by device and stream
+
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
 SSIM_CONSTANTS: dict[str, Any] = {"c1": SSIM_C1, "c2": SSIM_C2}
@@ -116,8 +122,8 @@ def _loss_kernel(
     Args:
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
         by_mean, by_square, by_product: with the strides of x.
-        total: the loss; unused if `mapped`.
-        l1: L1 alone; unused unless `apart`, and with sizes that are not `mixed`.
+        total: the loss, where lambda is there before, or 0 if `apart` is 1; unused if `mapped`.
+        l1: L1 alone; unused unless `apart` is 1, for sizes that are not `mixed`.
         values: SSIM itself, with the strides of x; unused unless `mapped`.
         sizes: (b, 2) of the images' own parts if they are `mixed`; weights are then divided by their pixels here.
         scale: of y.
@@ -166,7 +172,7 @@ def _loss_kernel(
         products, sums_product = _shifted(sums_product, tl.join(product0, product1), window, radius)
         if row >= first + radius:
             ssim, slope, curvature, share = _ssim(mean, mean_y, squares, products, c1, c2)
-            loss -= tl.where(inside, ssim_weight * ssim, 0.0)
+            loss -= tl.where(inside, ssim_weight * (ssim - apart), 0.0)
             here = out + (row - radius).to(tl.int64) * x_row
             tl.store(by_mean + here, slope, inside)
             tl.store(by_square + here, curvature, inside)
@@ -243,8 +249,10 @@ class _PhotometricLoss(torch.autograd.Function):
     def forward(
         ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None, apart: bool
     ) -> Tensor | tuple[Tensor, Tensor]:
-        total = torch.full((), ssim_weight, device=prediction.device)
-        l1 = torch.zeros_like(total) if apart else total
+        if apart:
+            total, l1 = _zero(prediction.device), _zero(prediction.device)
+        else:
+            total = l1 = torch.full((), ssim_weight, device=prediction.device)
         assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
         maps = [torch.empty_like(prediction) for _ in range(3)]
         assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
@@ -252,7 +260,7 @@ class _PhotometricLoss(torch.autograd.Function):
         programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
             _loss_kernel, programs, prediction, target, *maps, total, l1, total, own, *numbers, **constants,
-            **SSIM_CONSTANTS, mapped=False, apart=apart, **CONSTANTS,
+            **SSIM_CONSTANTS, mapped=False, apart=int(apart), **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         ctx.ssim_weight, ctx.own = ssim_weight, None if sizes is None else own
@@ -280,6 +288,18 @@ class _PhotometricLoss(torch.autograd.Function):
         return gradient if by_distance is None else gradient + by_distance, None, None, None, None
 
 
+def _zero(device: torch.device) -> Tensor:
+    """Return a new scalar 0 of the current stream; many are filled in one launch."""
+    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+    zeros = _zeros.setdefault((device, stream), [])
+    if not zeros:
+        block = torch.zeros(ZEROS * ZERO_STEP, device=device).untyped_storage()
+        # No views: scripts may change a loss in place.
+        scalars = (torch.empty(0, device=device) for _ in range(ZEROS))
+        zeros += [scalar.set_(block, ZERO_STEP * i, ()) for i, scalar in enumerate(scalars)]  # type: ignore[call-overload]
+    return zeros.pop()
+
+
 class _SsimMap(torch.autograd.Function):
     """Map (prediction, target), images (b, 3, h, w), to SSIM of each pixel and colour."""
 
@@ -289,7 +309,7 @@ class _SsimMap(torch.autograd.Function):
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
             _loss_kernel, programs, prediction, target, *maps, values, values, values, values, *numbers, **constants,
-            **SSIM_CONSTANTS, mapped=True, apart=False, **CONSTANTS,
+            **SSIM_CONSTANTS, mapped=True, apart=0, **CONSTANTS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, target, *maps)
         return values
