@@ -42,7 +42,7 @@ class RunSettings(HierarchySettings):
     )
     fused_ssim: bool = option(
         True,
-        "Compute the checkout's photometric loss, or its SSIM alone, in our kernels, where its functions return the same.",
+        "Compute the checkout's loss, or its SSIM alone, in our kernels, where its functions return the same.",
         panel=STORAGE,
         names=("--fused-ssim/--no-fused-ssim",),
     )
