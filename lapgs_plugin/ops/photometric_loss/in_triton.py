@@ -25,11 +25,11 @@ BLOCK = 128
 LEAST_ROWS = 16
 """Fewest rows of a program, which reads ten more."""
 
-ZEROS = 256
-"""Zeros that are filled together."""
+PAIRS = 128
+"""Pairs of zeros that are filled together."""
 ZERO_STEP = 4
 """Numbers from one to the next: `launch` wants tensors that begin at multiples of 16 bytes."""
-_zeros: dict[tuple[torch.device, int], list[Tensor]] = {}  # that are left, by device and stream
+_zeros: dict[tuple[torch.device, int], list[tuple[Tensor, Tensor]]] = {}  # that are left, by device and stream
 
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
@@ -250,7 +250,7 @@ class _PhotometricLoss(torch.autograd.Function):
         ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None, apart: bool
     ) -> Tensor | tuple[Tensor, Tensor]:
         if apart:
-            total, l1 = _zero(prediction.device), _zero(prediction.device)
+            total, l1 = _two_zeros(prediction.device)
         else:
             total = l1 = torch.full((), ssim_weight, device=prediction.device)
         assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
@@ -288,16 +288,20 @@ class _PhotometricLoss(torch.autograd.Function):
         return gradient if by_distance is None else gradient + by_distance, None, None, None, None
 
 
-def _zero(device: torch.device) -> Tensor:
-    """Return a new scalar 0 of the current stream; many are filled in one launch."""
+def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return two new scalars 0 of the current stream; many are filled in one launch."""
     stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
-    zeros = _zeros.setdefault((device, stream), [])
-    if not zeros:
-        block = torch.zeros(ZEROS * ZERO_STEP, device=device).untyped_storage()
-        # No views: scripts may change a loss in place.
-        scalars = (torch.empty(0, device=device) for _ in range(ZEROS))
-        zeros += [scalar.set_(block, ZERO_STEP * i, ()) for i, scalar in enumerate(scalars)]  # type: ignore[call-overload]
-    return zeros.pop()
+    pairs = _zeros.setdefault((device, stream), [])
+    if not pairs:
+        with torch.inference_mode(False):
+            block = torch.zeros(2 * PAIRS * ZERO_STEP, device=device).untyped_storage()
+            # No views: scripts may change a loss in place.
+            scalars = [
+                torch.empty(0, device=device).set_(block, ZERO_STEP * i, ())  # type: ignore[call-overload]
+                for i in range(2 * PAIRS)
+            ]
+        pairs += zip(scalars[::2], scalars[1::2], strict=True)
+    return pairs.pop()
 
 
 class _SsimMap(torch.autograd.Function):
