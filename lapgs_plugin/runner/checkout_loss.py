@@ -78,9 +78,7 @@ def _losses(l1: Any, ssim: Any, batched: bool, image: Any, target: Any, weight: 
     if images is None or images[0] is not image or image.ndim != 3 or type(weight) is not float or not 0 <= weight <= 1:
         return None
     device, of_ssim = image.device, _batch_difference if batched else _difference
-    if device.type != "cpu" and not photometric_loss.triton_works(image):
-        return None
-    if not (_agrees(_l1_difference, l1, device) and _agrees(of_ssim, ssim, device)):
+    if not (_has_one_kernel(image) and _agrees(_l1_difference, l1, device) and _agrees(of_ssim, ssim, device)):
         return None
     loss, distance = photometric_loss.loss_and_l1(image, target, weight)
     return distance, loss
@@ -111,6 +109,11 @@ def _fits(image: Tensor) -> bool:
 def _has_kernels(image: Tensor) -> bool:
     on_gpu = image.device.type != "cpu"
     return not on_gpu or photometric_loss.triton_works(image) or photometric_loss.fused_ssim() is not None
+
+
+def _has_one_kernel(image: Tensor) -> bool:
+    """Return whether one kernel computes L1 and SSIM of an image; on a CPU nothing would be gained."""
+    return photometric_loss.triton_works(image)
 
 
 def _our_ssim(image: Tensor, other: Tensor) -> Tensor:

@@ -64,8 +64,6 @@ class StageModel:
     def prepare_optimizers(self, gaussians: Any, inherit: bool) -> None:
         """Set the rate of SH in the checkout's new optimizers, and let them inherit state; fuse operations on a GPU.
 
-        Their tensors are contiguous afterwards.
-
         Args:
             gaussians: the checkout's model.
             inherit: whether the stage begins; optimizers that a loop makes later start anew in the checkout, too.
@@ -76,7 +74,6 @@ class StageModel:
         if self._options.sh_rate != 1.0:
             _scale_sh_rate(optimizers, self._options.sh_rate)
         for optimizer in optimizers:
-            _store_by_rows(optimizer)
             if inherit and self._before is not None:
                 self._inherit_moments(optimizer, self._before.moments)
             if self._options.fused_adam and self._device.type == "cuda":
@@ -125,16 +122,6 @@ class StageModel:
                 optimizer.state[group["params"][0]] = {
                     name: value[self._kept].to(self._device) if value.ndim else value for name, value in state.items()
                 }
-
-
-def _store_by_rows(optimizer: torch.optim.Optimizer) -> None:
-    """Make an optimizer's tensors contiguous: readers of the family return points that are stored by columns.
-
-    Until the first densification each step of Adam and each projection would copy them.
-    """
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            parameter.data = parameter.data.contiguous()
 
 
 def _of_gaussians(optimizer: torch.optim.Optimizer) -> list[dict[str, Any]]:

@@ -67,6 +67,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[torch.Size]:
         return photometric_loss.photometric_loss(image, target, weight), mean_distance(image, target)
 
     monkeypatch.setattr(checkout_loss.photometric_loss, "loss_and_l1", losses)
+    monkeypatch.setattr(checkout_loss, "_has_one_kernel", lambda image: True)
     return shapes
 
 
@@ -147,6 +148,12 @@ def test_a_weight_that_is_learned_gets_its_gradient(
     loss.backward()
     assert opt.weight.grad is not None
     assert not counted
+
+
+def test_on_a_cpu_the_statements_are_executed(load_module: Callable[[str], ModuleType]) -> None:
+    module = load_module(SCRIPT.format(f"{L1}\n    {ONE}"))
+    pairs = [function(*images(3, 21, 34), Options()) for function in (module.training, in_one_kernel(module.training))]
+    assert pairs[0] == pairs[1]
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5])

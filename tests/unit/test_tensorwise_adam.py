@@ -57,6 +57,7 @@ def test_steps_are_those_of_pytorch(device: str, betas: tuple[float, float], wor
     step(stepped, ours, 0), step(expected, theirs, 0)  # so that there is state to take over
     fuse_steps(ours)
     assert type(ours) is TensorwiseAdam
+    assert all(tensor.is_contiguous() for one in stepped for tensor in (one, *ours.state[one].values()))
     for seed in range(1, 5):
         step(stepped, ours, seed)
         step(expected, theirs, seed)

@@ -85,7 +85,11 @@ def _are_alike(first: Tensor, *others: Tensor) -> bool:
 
 
 def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
-    """Let a plain Adam on a CUDA device step each tensor in one kernel instead of a dozen; other optimizers stay."""
+    """Let a plain Adam on a CUDA device step all tensors in one kernel instead of a dozen each; other optimizers stay.
+
+    Tensors are stored by rows for it. Readers of the family return points that are stored by columns, and so are
+    positions until the first densification.
+    """
     if type(optimizer) is not torch.optim.Adam or not all(map(_is_plain, optimizer.param_groups)):
         return
     ours = triton_works()
@@ -95,8 +99,11 @@ def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
         else:
             group["fused"], group["foreach"] = True, False
         for parameter in group["params"]:
+            if ours:
+                parameter.data = parameter.data.contiguous()
             if "step" in (state := optimizer.state.get(parameter, {})):
                 state["step"] = torch.as_tensor(state["step"]).to("cpu" if ours else parameter.device)
+                state.update({name: state[name].contiguous() for name in ("exp_avg", "exp_avg_sq") if ours})
     if ours:
         optimizer.__class__ = TensorwiseAdam
 
