@@ -77,7 +77,7 @@ def _losses(l1: Any, ssim: Any, batched: bool, image: Any, target: Any, weight: 
     images = _images({"image": image, "target": target})
     if images is None or images[0] is not image or image.ndim != 3 or type(weight) is not float or not 0 <= weight <= 1:
         return None
-    device, of_ssim = image.device, _batch_difference if batched else _difference
+    device, of_ssim = image.device, _batch_difference if batched else _loss_difference
     if not (_has_one_kernel(image) and _agrees(_l1_difference, l1, device) and _agrees(of_ssim, ssim, device)):
         return None
     loss, distance = photometric_loss.loss_and_l1(image, target, weight)
@@ -120,19 +120,34 @@ def _our_ssim(image: Tensor, other: Tensor) -> Tensor:
     return 1.0 - photometric_loss.photometric_loss(image, other, ssim_weight=1.0)
 
 
-def _difference(original: Callable[..., Any], device: torch.device) -> float:
+def _ssim_of_loss(image: Tensor, other: Tensor) -> Tensor:
+    return 1.0 - photometric_loss.loss_and_l1(image, other, 1.0)[0]
+
+
+def _l1_of_loss(image: Tensor, other: Tensor) -> Tensor:
+    return photometric_loss.loss_and_l1(image, other, 0.2)[1]
+
+
+def _difference(
+    original: Callable[..., Any], device: torch.device, ours: Callable[[Tensor, Tensor], Tensor] = _our_ssim
+) -> float:
     """Return how far a function is from our SSIM and gradient of two images; its own are computed in float64."""
-    return _apart(_our_ssim, lambda image, other: original(image.double(), other.double()), device)
+    return _apart(ours, lambda image, other: original(image.double(), other.double()), device)
+
+
+def _loss_difference(original: Callable[..., Any], device: torch.device) -> float:
+    """Return how far a function of images is from SSIM in our loss."""
+    return _difference(original, device, _ssim_of_loss)
 
 
 def _batch_difference(original: Callable[..., Any], device: torch.device) -> float:
-    """Return how far a function of batches is from our SSIM; compiled ones take nothing but float32."""
-    return _apart(_our_ssim, lambda image, other: original(image[None], other[None]), device)
+    """Return how far a function of batches is from SSIM in our loss; compiled ones take nothing but float32."""
+    return _apart(_ssim_of_loss, lambda image, other: original(image[None], other[None]), device)
 
 
 def _l1_difference(original: Callable[..., Any], device: torch.device) -> float:
-    """Return how far a function is from the mean absolute difference, as a multiple of what is allowed for SSIM."""
-    return _apart(lambda image, other: (image - other).abs().mean(), original, device) / L1_PRECISION
+    """Return how far a function is from L1 in our loss, in units in which as much is allowed as for SSIM."""
+    return _apart(_l1_of_loss, original, device) / L1_PRECISION
 
 
 def _apart(ours: Callable[..., Tensor], theirs: Callable[..., Tensor], device: torch.device) -> float:

@@ -65,7 +65,8 @@ def test_loss(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: py
     ours = photometric_loss.loss_and_l1
 
     def counted(image: torch.Tensor, target: torch.Tensor, weight: float) -> tuple[torch.Tensor, torch.Tensor]:
-        called.append(image.shape)
+        if image.shape != (3, 29, 43):  # that functions are compared on before
+            called.append(image.shape)
         return ours(image, target, weight)
 
     monkeypatch.setattr(photometric_loss, "loss_and_l1", counted)

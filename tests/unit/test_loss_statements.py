@@ -30,6 +30,8 @@ def training(image, gt, opt):
 ONE = "loss = (1.0 - opt.weight) * Ll1 + opt.weight * (1.0 - ssim(image, gt))"
 BATCHES = "value = ssim(image.unsqueeze(0), gt.unsqueeze(0))"
 SET = "loss = (1.0 - opt.weight) * Ll1 + opt.weight * (1.0 - value)"
+COMPARED = (3, 29, 43)
+"""Size of the images on which functions are compared before."""
 L1 = "Ll1 = l1_loss(image, gt)"
 
 
@@ -63,7 +65,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[torch.Size]:
     shapes: list[torch.Size] = []
 
     def losses(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-        shapes.append(image.shape)
+        if image.shape != COMPARED:
+            shapes.append(image.shape)
         return photometric_loss.photometric_loss(image, target, weight), mean_distance(image, target)
 
     monkeypatch.setattr(checkout_loss.photometric_loss, "loss_and_l1", losses)
