@@ -272,7 +272,7 @@ def test_gradients_are_those_of_the_oracle_in_double_precision(device: str) -> N
     assert len(own) == 4
     for name in own:
         error = float((own[name] - exact[name]).norm() / exact[name].norm())
-        # Worst seen 2.1e-6 on a CPU. On a GPU 7.8e-3: an opacity next to 1/255 counts in three pixels in one of the two.
+        # Worst seen 2.1e-6 on a CPU; on a GPU 7.8e-3: in one of the two, three pixels have an opacity below 1/255.
         assert error < (1e-4 if device == "cpu" else 2e-2), name
 
 
