@@ -29,6 +29,8 @@ QUALITY = {
     "SSIM": ("ssim", "{:.4f}"),
     "LPIPS": ("lpips", "{:.4f}"),
 }
+OURS = "--rasterizer lapgs"
+"""Option of runs of checkouts with our rasterizer; their own scripts beside them have their own."""
 COST = {"busy (s)": ("busy_seconds", "{:.1f}"), "peak GB": ("peak_gb", "{:.2f}")}
 
 
@@ -98,14 +100,21 @@ def train() -> str:
     return compared("train", "one field", scene_title, ("scene",), with_fit=True)
 
 
-def checkouts(fastgs: bool) -> str:
-    """Return checkouts under `lapgs run` beside their own scripts: FastGS, or the others."""
+def checkouts(ours: bool, fastgs: bool | None = None) -> str:
+    """Return checkouts under `lapgs run` beside their own scripts.
+
+    Args:
+        ours: those that our rasterizer renders, or those with their own.
+        fastgs: FastGS alone, or the others; None for all.
+    """
 
     def title(run: Run) -> str:
-        options = f", `{run['options']}`" if run["options"] else ""
+        options = "" if ours or not run["options"] else f", `{run['options']}`"
         return f"{run['checkout']}, {run['scene']}{options} ({run['gpu']}, {run['date']})"
 
-    runs = [run for run in runs_of("checkouts") if (run["checkout"] == "FastGS") == fastgs]
+    runs = [run for run in runs_of("checkouts") if (run["options"] == OURS) == ours]
+    if fastgs is not None:
+        runs = [run for run in runs if (run["checkout"] == "FastGS") == fastgs]
     columns = {title: QUALITY[title] for title in ("PSNR (dB)", "LPIPS")} | {"peak GB": COST["peak GB"]}
     rows = []
     for methods in grouped(runs, "checkout", "scene").values():
@@ -128,8 +137,9 @@ def cpu() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "train": train,
-    "fastgs": lambda: checkouts(True),
-    "forks": lambda: checkouts(False),
+    "ours": lambda: checkouts(ours=True),
+    "fastgs": lambda: checkouts(ours=False, fastgs=True),
+    "forks": lambda: checkouts(ours=False, fastgs=False),
     "cpu": cpu,
 }
 
