@@ -1,4 +1,4 @@
-"""Write the tables of docs/results.md from the measured runs in docs/data/.
+"""Write the tables of docs/results.md and its note from the measured runs in docs/data/.
 
 Run `python docs/tables.py` after changing a data file; a test compares the document with it. A table stands between
 `<!-- table: NAME -->` and `<!-- end -->`. Each row of a data file is one run; a table shows means over seeds.
@@ -17,7 +17,7 @@ from statistics import fmean
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs/data"
-DOCUMENTS = (ROOT / "docs/results.md",)
+DOCUMENTS = (ROOT / "docs/results.md", ROOT / "docs/notes/2026-11-results.md")
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 Run = Mapping[str, str]
