@@ -18,7 +18,6 @@ import torch
 
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.ranks.archive import open_for
 from lapgs_plugin.training.ranks.group import Ranks, joined
@@ -30,15 +29,17 @@ from tests.training_scene import ring_scene
 
 STARTED_ON = 2
 """Ranks that all these runs are started on."""
+PHOTOS = 13
+"""Training photos, the last of which have shards to themselves in an epoch."""
 
 
 def plain_scene() -> Scene:
-    return ring_scene(train=13)
+    return ring_scene(train=PHOTOS)
 
 
 def masked_scene() -> Scene:
-    """The scene with the upper part of some photos outside of masks."""
-    scene = ring_scene(train=13)
+    """The scene with the upper part of every second photo outside of its mask."""
+    scene = plain_scene()
     inside = torch.ones(1, *scene.train[0].image.shape[1:], dtype=torch.bool)
     inside[:, :12] = False
     views = [replace(view, mask=inside) if index % 2 else view for index, view in enumerate(scene.train)]
@@ -47,63 +48,56 @@ def masked_scene() -> Scene:
 
 def mixed_scene() -> Scene:
     """The scene with photos of two sizes."""
-    small, large = ring_scene(train=13, size=(40, 56)), ring_scene(train=13)
+    small, large = ring_scene(train=PHOTOS, size=(40, 56)), plain_scene()
     views = zip(small.train, large.train, strict=True)
     return replace(large, train=tuple(pair[index % 2] for index, pair in enumerate(views)))
 
 
 def settings(strategy: Any, name: str, **values: Any) -> TrainSettings:
-    density = Densification(strategy=name, options=strategy, start=8, until=60, every=10)
-    defaults = {"iterations": 60, "sh_degree": 1, "levels": 2, "sh_every": 20, "accumulate_views": 4}
+    density = Densification(strategy=name, options=strategy, start=4, until=40, every=8)
+    defaults = {"iterations": 40, "sh_degree": 1, "levels": 2, "sh_every": 12, "accumulate_views": 4}
     return TrainSettings(densification=density, ranks=STARTED_ON, **{**defaults, **values})
 
 
 CASES: dict[str, tuple[Callable[[], Scene], TrainSettings]] = {
     "laplacian": (plain_scene, settings(Gradients(), "3dgs", hierarchy="laplacian", joint=0.5)),
     "nested": (plain_scene, settings(Mcmc(cap_max=150), "mcmc", hierarchy="nested", exposure="on", dropout=0.3)),
-    "residual": (masked_scene, settings(Mcmc(cap_max=150), "mcmc", hierarchy="laplacian", joint=0.5)),
-    "multiview": (mixed_scene, settings(Multiview(), "multiview", levels=1, iterations=40, prune=0.02)),
-    "poses": (plain_scene, settings(Gradients(), "3dgs", levels=1, iterations=40, refine_poses=True, keep="best")),
+    "masks": (masked_scene, settings(Mcmc(cap_max=150), "mcmc", hierarchy="laplacian", joint=0.5)),
+    "mixed sizes": (mixed_scene, settings(Multiview(), "multiview", levels=1, prune=0.02)),
+    "poses": (plain_scene, settings(Gradients(), "3dgs", levels=1, refine_poses=True, keep="best")),
 }
 
 
-def train(path: Path, name: str, ranks: Ranks, monitor: Monitor | None = None, **control: Any) -> None:
+def train(path: Path, name: str, ranks: Ranks) -> None:
     """Train a case into a new folder."""
     make, asked = CASES[name]
     with open_for(ranks, path, lambda kind: kind.create(path, ring_manifest(asked))) as archive:
-        chosen = TrainingControl(test_every=20, **control)
-        run = PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), chosen, ranks=ranks)
-        Trainer(run, monitor=monitor or Monitor()).run()
+        control = TrainingControl(test_every=20)
+        Trainer(PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), control, ranks=ranks)).run()
 
 
-def started(size: int, words: Sequence[object]) -> list[subprocess.Popen[str]]:
-    """Start this file as so many ranks."""
+def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Popen[str]]:
+    """Start a module as ranks of this machine, as torchrun's agent does, each with arguments of its own."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    shared = {
-        "MASTER_ADDR": "localhost",
-        "MASTER_PORT": str(port),
-        "TORCHELASTIC_RUN_ID": "test",
-        "OMP_NUM_THREADS": "1",
-    }
-    ranks = []
-    for rank in map(str, range(size)):
-        own = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": str(size), "LOCAL_WORLD_SIZE": str(size)}
-        command = [sys.executable, "-m", "tests.ranks", *map(str, words)]
-        ranks.append(
-            subprocess.Popen(
-                command,
-                env={**os.environ, **shared, **own},
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
+    size = str(len(words))
+    shared = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "TORCHELASTIC_RUN_ID": "test"}
+    shared |= {"WORLD_SIZE": size, "LOCAL_WORLD_SIZE": size, "OMP_NUM_THREADS": "1"}
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", module, *map(str, own)],
+            env={**os.environ, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
-    return ranks
+        for rank, own in enumerate(words)
+    ]
 
 
 def main() -> None:
+    """Train the cases of the command line as one of the ranks."""
     ranks = joined()
     for name in sys.argv[2:]:
         train(Path(sys.argv[1]) / name, name, ranks)

@@ -17,6 +17,7 @@ from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, sizes_on_device
 from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import USUAL_EXTENT, Gradients, Strategy
 
@@ -43,8 +44,12 @@ class DensityControl:
 
     Attributes:
         state: statistics it keeps between iterations, for checkpoints: numbers, or None for what becomes a tensor
-            (n, ...) of one row a Gaussian, whose rows are edited with the field's.
+            (n, ...) of one row a Gaussian, whose rows are edited with the field's. On several ranks they are sums over
+            the views of all.
+        ranks: that train the field. What is drawn or rounded at random has to be the same on all.
     """
+
+    ranks: Ranks = ALONE
 
     def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:
         self.state: dict[str, Any] = {}

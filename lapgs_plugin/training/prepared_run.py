@@ -166,7 +166,9 @@ class PreparedRun(StagedRun):
 
     def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
         """Return the density control of a stage."""
-        return control_of(self.strategy_of(stage), schedule, self.scene.extent)
+        control = control_of(self.strategy_of(stage), schedule, self.scene.extent)
+        control.ranks = self.ranks
+        return control
 
     def schedule_of(self, stage: Stage) -> StageSchedule:
         """Return the schedule of a stage."""

@@ -82,7 +82,8 @@ class FieldScoring:
         plain, grey = _grey(field)
         own = [self.views[index] for part in self.steps.own(range(len(self.views))) for index in part]
         pixels = blended_pixels((self._render(plain, view, 0) for view in own), grey)
-        return least_blended(self.steps.ranks.largest(pixels), share)
+        ranks = self.steps.ranks
+        return ranks.as_leader(least_blended(ranks.largest(pixels), share))
 
     def _render(self, field: GaussianField, view: LevelView, degree: int) -> Tensor:
         camera = at_pose(view, self.poses).camera

@@ -178,6 +178,7 @@ class StageRun:
         Raises:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
+        self.require_equal_fields()
         if self.budget is not None:
             self.budget.start(self.counts.iteration)
         while self.counts.iteration < self.stage.iterations:

@@ -83,6 +83,10 @@ class Ranks:
         """Return the elementwise maximum over all ranks."""
         return tensor
 
+    def as_leader(self, tensor: Tensor) -> Tensor:
+        """Return the tensor of rank 0, for results that a GPU may round otherwise each time; all have its shape."""
+        return tensor
+
     def close(self) -> None:
         """Leave the group."""
 
@@ -104,7 +108,7 @@ class JoinedRanks(Ranks):
         self.rank, self.size, self._local_rank = rank, size, local_rank
         self._dist: Any = dist
         self._device = torch.device("cpu")
-        self._sums: Any = None
+        self._sums: Any = None  # NCCL's group; None is that of gloo
         if local_rank < torch.cuda.device_count():
             torch.cuda.set_device(local_rank)  # before anything is put on a GPU
         try:
@@ -137,6 +141,7 @@ class JoinedRanks(Ranks):
         if self._sums is None:
             with self._others():
                 self._sums = self._dist.new_group(backend="nccl", timeout=PATIENCE)
+                self._dist.all_reduce(torch.zeros(1, device=device), group=self._sums)  # connects the GPUs
 
     def wait(self) -> None:
         with self._others():
@@ -188,8 +193,12 @@ class JoinedRanks(Ranks):
 
     def largest(self, tensor: Tensor) -> Tensor:
         with self._others():
-            group = self._sums if self._device.type == "cuda" else None
-            self._dist.all_reduce(tensor, self._dist.ReduceOp.MAX, group=group)
+            self._dist.all_reduce(tensor, self._dist.ReduceOp.MAX, group=self._sums)
+        return tensor
+
+    def as_leader(self, tensor: Tensor) -> Tensor:
+        with self._others():
+            self._dist.broadcast(tensor, src=0, group=self._sums)
         return tensor
 
     def close(self) -> None:
