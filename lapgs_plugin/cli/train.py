@@ -56,21 +56,29 @@ class StartOptions:
     )
     viewing: ViewOptions = field(default_factory=ViewOptions)
 
-    def ranks(self, rasterizer: str) -> int:
-        """Return the number of processes that are asked for.
+    def __post_init__(self) -> None:
+        if self.gpus is not None and self.processes is not None:
+            raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
+
+    def launches(self, rasterizer: str) -> bool:
+        """Run this command on several ranks if that is asked for; return whether it has.
 
         Args:
             rasterizer: that is asked for.
 
         Raises:
-            UserInputError: the options contradict each other or the machine, or torchrun started another number.
+            UserInputError: the machine has not as many GPUs, or torchrun started another number of ranks.
         """
-        if self.gpus is not None and self.processes is not None:
-            raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
+        asked = self.gpus or self.processes
         if self.gpus is not None:
             launcher.require_gpus(self.gpus, rasterizer)
-        asked = self.gpus or self.processes
-        return launcher.size(asked) if launcher.is_rank() else asked or 1
+        if launcher.is_rank():
+            launcher.join_started(asked)
+            return False
+        if asked is None or asked == 1:
+            return False
+        launcher.launch(asked, self.gpus is not None, sys.argv[1:])
+        return True
 
 
 @takes_settings
@@ -110,13 +118,9 @@ def train(
     from lapgs_plugin.training.preparation import TrainRequest, prepare
     from lapgs_plugin.training.ranks.group import joined
 
-    ranks, leads = start.ranks(control.rasterizer), launcher.leads()
-    if launcher.is_rank():
-        launcher.end_when_stuck()
-    elif ranks > 1 and not isinstance(context.obj, Rehearsal):
-        launcher.launch(ranks, start.gpus is not None, sys.argv[1:])
+    if not isinstance(context.obj, Rehearsal) and start.launches(control.rasterizer):
         return
-    if leads:
+    if leads := launcher.leads():
         log_to_stderr("%(message)s")
     chosen = {name for name in chosen_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
     request = TrainRequest(
@@ -139,14 +143,8 @@ def train(
     request = replace(request, ranks=joined())
     with prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
-        if not leads:
-            pass
-        elif not run.resumes:
-            masks = run.archive.manifest.scene.masks
-            length = run.settings.iterations if run.settings.time is None else None
-            write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
-        elif run.settings.extended:
-            extended = extended_config(path, run.settings)
+        if leads:
+            extended = _write_options(path, run, context)
         _train(run, watcher)
         if extended is not None:
             write_text(path, extended)
@@ -158,6 +156,16 @@ def train(
 
         save_run_preview(out, moved_to=scene)
     _say_what_is_next(out)
+
+
+def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str | None:
+    """Write the options of a new run into its folder; return those of one that is extended, to be written after it."""
+    if run.resumes:
+        return extended_config(path, run.settings) if run.settings.extended else None
+    masks = run.archive.manifest.scene.masks
+    length = run.settings.iterations if run.settings.time is None else None
+    write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
+    return None
 
 
 def _train(run: PreparedRun, watcher: Watcher) -> None:

@@ -51,18 +51,21 @@ def is_rank() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("WORLD_SIZE", "1") != "1"
 
 
-def size(asked: int | None) -> int:
-    """Return the number of ranks that torchrun's agent started.
+def join_started(asked: int | None) -> None:
+    """Get ready to be one of the ranks that torchrun's agent started.
+
+    Args:
+        asked: number of ranks that the command line asks for; None leaves it to torchrun.
 
     Raises:
-        UserInputError: another number is asked for.
+        UserInputError: that is another number.
     """
     started = int(os.environ["WORLD_SIZE"])
     if asked not in (None, started):
         raise UserInputError(
             f"--gpus {asked}: torchrun started {started} ranks; leave the option out, or give {started}"
         )
-    return started
+    _end_when_stuck()
 
 
 def leads() -> bool:
@@ -90,7 +93,7 @@ def end_rank(error: BaseException, text: str, code: int) -> NoReturn:
     os._exit(code)  # libraries would wait for ranks that are gone
 
 
-def end_when_stuck() -> None:
+def _end_when_stuck() -> None:
     """End this process some time after a signal that it does not react to."""
     read, write = os.pipe()
     os.set_blocking(write, False)
