@@ -51,12 +51,11 @@ class BetweenSteps:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
         evaluation, test_every = self.evaluation, run.prepared.control.test_every
-        stop, save = self._decided(run)
         iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self._sampled(run.schedule))
         due_tick = run.passed(run.record.history_every)
-        if due_test or due_sample or due_tick or stop:
+        if due_test or due_sample or due_tick:
             run.settle()  # so that iterations in progress do not count as overhead
         measured = evaluation.held_out(due_test, due_sample and test_every is None)
         if due_sample and run.prepared.aside:
@@ -65,11 +64,14 @@ class BetweenSteps:
             self._tick(run, measured)
         evaluation.warn_of_a_fall(measured)
         if self.watcher.wants_look():
-            run.settle()
+            run.catch_up()  # without the losses of other ranks, which do not look
             with run.record.overhead.timed("view"):
                 self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: self.stop.requested)
         if run.passed(EQUAL_EVERY):
             run.require_equal_fields()
+        stop, save = self._decided(run)
+        if stop:
+            run.settle()
         if stop or save:
             self._save_checkpoint(run)
         if stop:

@@ -228,16 +228,20 @@ class StageRun:
         """
         if not self._late_steps:
             return
-        self.record.resume_clock()
         waiting, self._unread, self._late_steps = self._unread, [], 0
+        self.catch_up()
         losses = torch.stack([loss for loss, _, _ in waiting]).tolist() if waiting else []
-        self.record.wait_for_device()
-        self.record.pause_clock()
         noted = [(iteration, loss, views) for loss, (_, iteration, views) in zip(losses, waiting, strict=True)]
         if self._steps.shared:
             noted = sorted(chain.from_iterable(self.prepared.ranks.gathered(noted)))
         for iteration, loss, views in noted:
             self._note_loss(loss, iteration, views)
+
+    def catch_up(self) -> None:
+        """Wait for a GPU to finish its iterations, as part of the training time."""
+        self.record.resume_clock()
+        self.record.wait_for_device()
+        self.record.pause_clock()
 
     def passed(self, every: int) -> bool:
         """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
