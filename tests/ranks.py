@@ -25,10 +25,12 @@ from lapgs_plugin.training.settings import Densification, TrainingControl, Train
 from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_runs import placed, ring_manifest
-from tests.training_scene import ring_scene
+from tests.training_scene import blob_field, ring_scene
 
 STARTED_ON = 2
 """Ranks that all these runs are started on."""
+DIFFERENT = "different"
+"""In place of a case: ranks whose fields differ."""
 PHOTOS = 13
 """Training photos, the last of which have shards to themselves in an epoch."""
 
@@ -68,12 +70,13 @@ CASES: dict[str, tuple[Callable[[], Scene], TrainSettings]] = {
 }
 
 
-def train(path: Path, name: str, ranks: Ranks) -> None:
-    """Train a case into a new folder."""
+def train(path: Path, name: str, ranks: Ranks, **decided: Any) -> None:
+    """Train a case into a new folder; `decided` are further arguments of `PreparedRun.of`."""
     make, asked = CASES[name]
     with open_for(ranks, path, lambda kind: kind.create(path, ring_manifest(asked))) as archive:
         control = TrainingControl(test_every=20)
-        Trainer(PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), control, ranks=ranks)).run()
+        run = PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), control, ranks=ranks, **decided)
+        Trainer(run).run()
 
 
 def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Popen[str]]:
@@ -97,10 +100,13 @@ def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Pop
 
 
 def main() -> None:
-    """Train the cases of the command line as one of the ranks."""
+    """Train the cases of the command line as one of the ranks, or start each rank from a field of its own."""
     ranks = joined()
     for name in sys.argv[2:]:
-        train(Path(sys.argv[1]) / name, name, ranks)
+        if name == DIFFERENT:
+            train(Path(sys.argv[1]) / name, "poses", ranks, first_field=blob_field(seed=ranks.rank))
+        else:
+            train(Path(sys.argv[1]) / name, name, ranks)
     ranks.close()
 
 

@@ -155,6 +155,14 @@ def test_ranks_of_different_runs_are_refused_by_rank_0_alone(scene: Path, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
+def test_ranks_whose_fields_differ_do_not_go_on(tmp_path: Path) -> None:
+    pair = ranks.start("tests.ranks", [[tmp_path, ranks.DIFFERENT]] * 2)
+    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in pair]
+    for process, output in zip(pair, outputs, strict=True):
+        assert process.returncode != 0
+        assert "level 0, iteration 0: the field of rank 1 is not that of rank 0" in output
+
+
 def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [f"{number}.png" for number in range(2)])
     three = ranks.start("lapgs_plugin", [["train", scene, "-o", tmp_path / "run", "--iterations", 20]] * 3)

@@ -7,6 +7,7 @@ the device for sums of tensors, NCCL on GPUs. Every rank calls the same methods 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -225,6 +226,7 @@ def joined() -> Ranks:
     size = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if size == 1:
         return ALONE
-    if os.environ.get("LOCAL_WORLD_SIZE") == str(size):  # of one machine, whose name may not resolve
+    alone = os.environ.get("LOCAL_WORLD_SIZE") == str(size)
+    if alone and sys.platform == "linux":  # its name may not resolve
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     return JoinedRanks(int(os.environ["RANK"]), size, int(os.environ["LOCAL_RANK"]))
