@@ -106,6 +106,18 @@ def advise(advice: str) -> None:
     _process.advice = f"; {advice}"
 
 
+def be_silent() -> None:
+    """Print no line in this process: the one that started it does."""
+    _process.said = True
+
+
+def stop_by(number: int) -> NoReturn:
+    """Act on a signal that another handler caught, as if it came now."""
+    _is_first(number)
+    _process.raised = True
+    raise Interrupted
+
+
 def exit_code(code: int) -> int:
     """Return the exit code after an error: 143 instead of 130 if SIGTERM stopped the command."""
     return 128 + _process.number if code == 130 and _process.number is not None else code

@@ -14,6 +14,11 @@ def main() -> None:
     import gc
     import os
 
+    if "LAPGS_RANK_REPORTS" in os.environ:
+        from lapgs_plugin.interrupt import be_silent
+
+        be_silent()  # the command that started this rank says how it ended
+
     # Importing torch makes a million objects and no garbage. Collections would take a tenth of the time until a command
     # begins.
     gc.set_threshold(10_000)

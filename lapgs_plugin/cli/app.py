@@ -30,6 +30,7 @@ from lapgs_plugin.cli.usage import one_line_usage_errors
 from lapgs_plugin.cli.view import view
 from lapgs_plugin.errors import LapgsError, UserInputError, typed_line
 from lapgs_plugin.registry import Registry
+from lapgs_plugin.training.ranks import launcher
 
 INSTALLED: Registry[typer.Typer] = Registry("lapgs", "lapgs.commands", typer.Typer, {})
 """Commands of entry points, such as `lapgs bench`; those of this file come first."""
@@ -157,9 +158,14 @@ def run(began: float | None = None) -> None:
     try:
         app(prog_name="lapgs", obj=began)
     except LapgsError as error:
-        print(f"lapgs: {error}", file=sys.stderr)
-        sys.exit(interrupt.exit_code(error.exit_code))
+        line, code = f"lapgs: {error}", interrupt.exit_code(error.exit_code)
+        if launcher.is_rank():
+            launcher.end_rank(error, line, code)
+        print(line, file=sys.stderr)
+        sys.exit(code)
     except Exception as error:
+        if launcher.is_rank():
+            launcher.end_rank(error, traceback.format_exc(), 1)
         from lapgs_plugin.checkouts.script import frames_of_script
 
         frames = frames_of_script(error)

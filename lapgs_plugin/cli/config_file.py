@@ -22,7 +22,7 @@ from lapgs_plugin.untrusted import read_text, read_toml
 if TYPE_CHECKING:
     from lapgs_plugin.training.settings import TrainSettings
 
-OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port"})
+OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port", "gpus", "processes"})
 """Parameters of a call that do not change the trained run."""
 
 META_KEY = "lapgs_plugin.config"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,12 +17,13 @@ from lapgs_plugin.cli.config_file import ConfigOption, extended_config, write_co
 from lapgs_plugin.cli.output import log_to_stderr, make_console, say
 from lapgs_plugin.cli.rehearsal import Rehearsal
 from lapgs_plugin.cli.viewing import ViewOptions, watching
-from lapgs_plugin.errors import printable
+from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option
 from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
 from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.training.ranks import launcher
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 
 if TYPE_CHECKING:
@@ -42,7 +44,41 @@ class StartOptions:
         "Continue the run in --out with its settings. A finished run is extended if --iterations is more than it has.",
     )
     overwrite: bool = option(False, "Replace the run in --out.")
+    gpus: int | None = option(
+        None,
+        "Share the views of each step out over so many GPUs of this machine; see `lapgs help scale`. torchrun -m "
+        "lapgs_plugin train does the same, also on several machines.",
+        least=1,
+        most=1024,
+    )
+    processes: int | None = option(
+        None, "The same over so many processes on its processors, to try --gpus without GPUs.", least=1, most=1024
+    )
     viewing: ViewOptions = field(default_factory=ViewOptions)
+
+    def __post_init__(self) -> None:
+        if self.gpus is not None and self.processes is not None:
+            raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
+
+    def launches(self, rasterizer: str) -> bool:
+        """Run this command on several ranks if that is asked for; return whether it has.
+
+        Args:
+            rasterizer: that is asked for.
+
+        Raises:
+            UserInputError: the machine has not as many GPUs, or torchrun started another number of ranks.
+        """
+        asked = self.gpus or self.processes
+        if self.gpus is not None:
+            launcher.require_gpus(self.gpus, rasterizer)
+        if launcher.is_rank():
+            launcher.join_started(asked)
+            return False
+        if asked is None or asked == 1:
+            return False
+        launcher.launch(asked, self.gpus is not None, sys.argv[1:])
+        return True
 
 
 @takes_settings
@@ -80,8 +116,12 @@ def train(
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1
     """
     from lapgs_plugin.training.preparation import TrainRequest, prepare
+    from lapgs_plugin.training.ranks.group import joined
 
-    log_to_stderr("%(message)s")
+    if not isinstance(context.obj, Rehearsal) and start.launches(control.rasterizer):
+        return
+    if leads := launcher.leads():
+        log_to_stderr("%(message)s")
     chosen = {name for name in chosen_options(context) if name not in CHOSEN_ONCE or context.params[name] != AUTO}
     request = TrainRequest(
         scene=scene,
@@ -92,28 +132,40 @@ def train(
         resume=start.resume,
         overwrite=start.overwrite,
         chosen=frozenset(chosen),
-        **({"began": context.obj} if isinstance(context.obj, float) else {}),
     )
-    watcher = context.with_resource(watching(start.viewing, out.absolute().name))
+    if isinstance(context.obj, float):
+        request = replace(request, began=context.obj)
+    viewing = start.viewing if leads else ViewOptions()
+    watcher = context.with_resource(watching(viewing, out.absolute().name))
     if isinstance(context.obj, Rehearsal):
         context.obj.train(request)
         return
+    request = replace(request, ranks=joined())
     with prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
-        if not run.resumes:
-            masks = run.archive.manifest.scene.masks
-            length = run.settings.iterations if run.settings.time is None else None
-            write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
-        elif run.settings.extended:
-            extended = extended_config(path, run.settings)
+        if leads:
+            extended = _write_options(path, run, context)
         _train(run, watcher)
         if extended is not None:
             write_text(path, extended)
+    request.ranks.close()
+    if not leads:
+        return
     if request.settings.time is None:  # a preview is beyond the time
         from lapgs_plugin.viewer.preview import save_run_preview
 
         save_run_preview(out, moved_to=scene)
     _say_what_is_next(out)
+
+
+def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str | None:
+    """Write the options of a new run into its folder; return those of one that is extended, to be written after it."""
+    if run.resumes:
+        return extended_config(path, run.settings) if run.settings.extended else None
+    masks = run.archive.manifest.scene.masks
+    length = run.settings.iterations if run.settings.time is None else None
+    write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
+    return None
 
 
 def _train(run: PreparedRun, watcher: Watcher) -> None:
@@ -122,6 +174,9 @@ def _train(run: PreparedRun, watcher: Watcher) -> None:
     from lapgs_plugin.training.tensorboard import TensorboardMonitor
     from lapgs_plugin.training.trainer import Trainer
 
+    if not run.ranks.leads:
+        Trainer(run).run()
+        return
     with ExitStack() as opened:
         monitor: Monitor = opened.enter_context(ProgressMonitor(make_console(stderr=True), run.plan.levels))
         if run.control.log is not None:

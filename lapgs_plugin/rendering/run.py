@@ -42,9 +42,12 @@ def run_renderer(
 
 
 def load_reference(
-    reference: SceneReference, check: Callable[[tuple[int, int], int], None] | None = None, hold: bool = True
+    reference: SceneReference,
+    check: Callable[[tuple[int, int], int], None] | None = None,
+    hold: bool = True,
+    read: bool = True,
 ) -> Scene:
-    """Load the scene that a manifest names, and read it as the manifest says; `check`, `hold` as `load_scene`."""
+    """Load the scene that a manifest names, as the manifest says; `check`, `hold` and `read` as `load_scene`."""
     return load_scene(
         reference.path,
         resolution=reference.resolution,
@@ -54,6 +57,7 @@ def load_reference(
         background=reference.background,
         check=check,
         hold=hold,
+        read=read,
     )
 
 

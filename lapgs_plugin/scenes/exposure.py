@@ -9,6 +9,7 @@ change of exposure changes both halves alike, reflections and shadows do not.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -51,15 +52,24 @@ class MeasuredExposure:
     spread: float
 
 
-def measure_exposure(scene: Scene) -> MeasuredExposure:
+LookUp = Callable[[Tensor], Sequence[tuple[Tensor, Tensor]]]
+"""Returns `colors_at` of all training photos at sparse points (n, 3)."""
+
+
+def measure_exposure(scene: Scene, look_up: LookUp | None = None) -> MeasuredExposure:
     """Measure how the exposure of a scene's training photos differs.
 
     The spread is 0 if too few points are visible, or if all have one colour, as random points do.
+
+    Args:
+        scene: with its photos.
+        look_up: reads the photos in another way than one after the other.
     """
     if len(scene.points) and bool((scene.colors == scene.colors[0]).all()):
         return MeasuredExposure(torch.zeros(len(scene.train), 3), 0.0)
     chosen = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:POINTS]
-    looked_up = [_colors_of(view, scene.points[chosen]) for view in scene.train]
+    points = scene.points[chosen]
+    looked_up = [colors_at(view, points) for view in scene.train] if look_up is None else look_up(points)
     colors, right = (torch.stack(views) for views in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)
     usable = ((colors > DARKEST) & (colors < BRIGHTEST)).all(-1)  # (v, n)
     often = usable.sum(0) >= LEAST_VIEWS
@@ -82,7 +92,7 @@ def measure_exposure(scene: Scene) -> MeasuredExposure:
     return MeasuredExposure(gains, math.sqrt(max(0.0, agreed**2 - disagreed**2)))
 
 
-def _colors_of(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
+def colors_at(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return a photo's colours (n, 3) at sparse points, 0 at unseen ones, and which are in its right half, (n,)."""
     step = max(1, round(max(view.camera.size) / SIDE))
     image, mask = view.image[None], view.mask

@@ -154,6 +154,7 @@ def load_scene(
     progress: bool | ProgressCallback = True,
     check: Callable[[tuple[int, int], int], None] | None = None,
     hold: bool = True,
+    read: bool = True,
 ) -> Scene:
     """Load a COLMAP scene (`images/`, `sparse/0/`), a transforms scene or another program's export with all its images.
 
@@ -173,6 +174,7 @@ def load_scene(
         check: called before any image is read, with `Scene.smallest_size` and the number of training views. An error
             that it raises ends the loading.
         hold: keep the images in memory. False reads each once, to find damaged ones, and again at each use.
+        read: False reads images only at each use, see `held_views`.
 
     Raises:
         SceneError: the folder, its model, an image or a mask cannot be used.
@@ -216,13 +218,16 @@ def load_scene(
                 return read_mask(mask_files[frame.name], image_size(frame.path), size)
             return alpha_mask(frame.path, size) if masks == ALPHA else None
 
+        if not read:
+            return View(frame.name, camera, image, mask if mask_files or masks == ALPHA else None)
         pixels, inside = image(), mask()
         if hold:
             return View(frame.name, camera, pixels, inside)
         return View(frame.name, camera, image, None if inside is None else mask)
 
     items = list(zip(frames, cameras, strict=True))
-    views = in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=progress)
+    shown = progress and read
+    views = in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=shown)
     if masks == ALPHA and not any(view.masked for view in views):
         raise UserInputError(
             f"--masks alpha: no image of {path} has transparent pixels; leave the option out, which uses "
@@ -239,6 +244,19 @@ def load_scene(
         background=background,
         unit=unit_of_depth(depth) if depth else 1.0,
     )
+
+
+def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = True) -> list[View]:
+    """Return views whose images are in memory; `progress` as `load_scene` takes it.
+
+    Raises:
+        SceneError: an image or a mask cannot be read.
+    """
+
+    def held(view: View) -> View:
+        return View(view.name, view.camera, view.image, view.mask)
+
+    return in_threads("Reading images", "images", held, views, most=MAX_WORKERS, progress=progress)
 
 
 def load_cameras(

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.runs.image_store import chosen_precision
-from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.level_images import ImageStores, LevelImages
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.stages.joint import Predictions
@@ -38,9 +37,10 @@ class StageImages:
     def __init__(
         self, run: StagedRun, stage: Stage, sizes: Sizes, *, eight_bit: bool, masked: bool, exact: bool = False
     ) -> None:
-        folder = run.archive.path(CACHE)
         self._run = run
-        self._stores = ImageStores(list(sizes.values()), run.device, eight_bit, run.settings.images_on, folder)
+        self._stores = ImageStores(
+            list(sizes.values()), run.device, eight_bit, run.settings.images_on, run.cache_folder
+        )
         with_coarse = stage.signed and run.supervision.needs_coarse
         self.photos = LevelImages(
             self._stores, stage.level, run.pyramid, with_coarse=with_coarse, masked=masked, exact=exact

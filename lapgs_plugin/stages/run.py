@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -53,14 +54,19 @@ class StagedRun:
         """The finished levels for messages, coarsest first."""
         return ", ".join(map(str, self.archive.available_levels)) or "none"
 
+    @property
+    def cache_folder(self) -> Path:
+        """Where images are kept on the disk."""
+        return self.archive.path(CACHE)
+
     @contextmanager
     def image_cache(self) -> Iterator[None]:
         """Keep images on the disk inside; remove them at the end, and at the beginning those of a killed run."""
-        shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
+        shutil.rmtree(self.cache_folder, ignore_errors=True)
         try:
             yield
         finally:
-            shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
+            shutil.rmtree(self.cache_folder, ignore_errors=True)
 
     def inherited(self, coarser: GaussianField, sh_degree: int | None = None) -> Inherited:
         """Return the first field of a residual, the same at every call.

@@ -17,6 +17,8 @@ from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
 """Time between two checkpoints unless a number of iterations is given."""
+EQUAL_EVERY = 1_000
+"""Iterations between two comparisons of the ranks' fields."""
 
 
 @dataclass
@@ -40,6 +42,7 @@ class BetweenSteps:
     last_checkpoint: float = field(default_factory=time.monotonic)
     _schedule: StageSchedule | None = field(default=None, init=False)
     _due: Collection[int] = field(default=(), init=False)
+    _steps: int = field(default=0, init=False)
 
     def __call__(self, run: StageRun) -> None:
         """Act on a step that has just ended.
@@ -47,12 +50,12 @@ class BetweenSteps:
         Raises:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
-        evaluation, stop, test_every = self.evaluation, self.stop, run.prepared.control.test_every
+        evaluation, test_every = self.evaluation, run.prepared.control.test_every
         iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
         due_sample = run.reached(self._sampled(run.schedule))
         due_tick = run.passed(run.record.history_every)
-        if due_test or due_sample or due_tick or stop.requested:
+        if due_test or due_sample or due_tick:
             run.settle()  # so that iterations in progress do not count as overhead
         measured = evaluation.held_out(due_test, due_sample and test_every is None)
         if due_sample and run.prepared.aside:
@@ -61,16 +64,32 @@ class BetweenSteps:
             self._tick(run, measured)
         evaluation.warn_of_a_fall(measured)
         if self.watcher.wants_look():
-            run.settle()
+            run.catch_up()  # without the losses of other ranks, which do not look
             with run.record.overhead.timed("view"):
-                self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: stop.requested)
-        if stop.requested or self._checkpoint_is_due(run):
+                self.watcher.look(run.stage, iteration, lambda: run.fields, lambda: self.stop.requested)
+        if run.passed(EQUAL_EVERY):
+            run.require_equal_fields()
+        stop, save = self._decided(run)
+        if stop:
+            run.settle()
+        if stop or save:
             self._save_checkpoint(run)
-        if stop.requested:
+        if stop:
             raise TrainingStoppedError(
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
                 f"a checkpoint is in {run.prepared.archive.path()}, the same command with --resume continues"
             )
+
+    def _decided(self, run: StageRun) -> tuple[bool, bool]:
+        """Return whether to stop, and whether to save a checkpoint, as all ranks decide at the same step."""
+        ranks, every = run.prepared.ranks, run.prepared.control.checkpoint_every
+        due = every is not None and run.counts.iteration % every < run.step_views
+        self._steps += 1
+        if self._steps % ranks.steps_a_decision:
+            return False, due
+        late = every is None and time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
+        stop, late = ranks.decide(self.stop.requested, late)
+        return stop, due or late
 
     def _sampled(self, schedule: StageSchedule) -> Collection[int]:
         """Return the iterations after which some views are measured, once for each schedule."""
@@ -95,12 +114,8 @@ class BetweenSteps:
         run.record.write_history(counts.iteration, figures)
         self.evaluation.monitor.tick(run.stage, tick)
 
-    def _checkpoint_is_due(self, run: StageRun) -> bool:
-        if (every := run.prepared.control.checkpoint_every) is not None:
-            return run.counts.iteration % every < run.step_views
-        return time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
-
     def _save_checkpoint(self, run: StageRun) -> None:
+        run.require_equal_fields()
         run.require_finite(run.counts.iteration)  # Gaussians of NaN are culled: the loss does not show them
         best, overhead = self.evaluation.best, run.record.overhead
         with overhead.timed("checkpoints"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
@@ -16,6 +17,7 @@ from lapgs_plugin.ops.densification_statistics import add_statistics
 from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, sizes_on_device
 from lapgs_plugin.ops.regularization import add_regularization
 from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.strategies import USUAL_EXTENT, Gradients, Strategy
 
@@ -42,8 +44,12 @@ class DensityControl:
 
     Attributes:
         state: statistics it keeps between iterations, for checkpoints: numbers, or None for what becomes a tensor
-            (n, ...) of one row a Gaussian, whose rows are edited with the field's.
+            (n, ...) of one row a Gaussian, whose rows are edited with the field's. On several ranks they are sums over
+            the views of all.
+        ranks: that train the field. What is drawn or rounded at random has to be the same on all.
     """
+
+    ranks: Ranks = ALONE
 
     def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:
         self.state: dict[str, Any] = {}
@@ -78,7 +84,8 @@ class DensityControl:
         Args:
             model: edited in place; its parameters are new tensors afterwards if something changed.
             iteration: of the step's last view, from 1 within the stage.
-            result, camera: as `accumulate` takes them; the result may be None where `needs_statistics` is false.
+            result, camera: as `accumulate` takes them. The result is None if that render's statistics are accumulated,
+                as they are on several ranks, and may be where `needs_statistics` is false.
             scores: of the field before the edit; None where `score_threshold` is None.
 
         Returns:
@@ -161,11 +168,10 @@ class Densifier(DensityControl):
     ) -> bool:
         if not self.needs_statistics(iteration):
             return False
-        assert result is not None, "needed in this iteration"
         refined, reset = self._schedule.refines(iteration), iteration % self._schedule.reset_every == 0
         if refined:
             self._refine(model, iteration, result, camera, scores)
-        else:
+        elif result is not None:
             self.accumulate(result, camera)
         if reset:
             # gsplat 1.5.3 never resets (its test reads `== 0 & step > 0`); later versions do, and twice is as once.
@@ -173,25 +179,21 @@ class Densifier(DensityControl):
         return refined or reset
 
     def _refine(
-        self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera, scores: ViewScores | None
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None,
     ) -> None:
-        """Accumulate the statistics of a render, and add and remove Gaussians by them."""
-        info = self._info(result, camera)
+        """Accumulate the statistics of a render, if there is one, and add and remove Gaussians by them."""
+        info = _nothing_shown(model, camera) if result is None else self._info(result, camera)
         self._strategy.step_post_backward(model.params, model.optimizers, self.state, iteration, info)
 
     def _info(self, result: RenderResult, camera: Camera) -> dict[str, Any]:
         """Return a render as gsplat's strategies expect it."""
         n = result.means2d.shape[-2]
-        means2d: Any = result.means2d.detach().view(-1, n, 2)  # (b, n, 2)
-        means2d.grad = means2d.absgrad = self._gradient(result).view(-1, n, 2)
-        return {
-            "means2d": means2d,
-            "radii": result.radii.view(-1, n, 1).expand(-1, -1, 2),  # (b, n, 2)
-            "width": camera.width,
-            "height": camera.height,
-            "n_cameras": 1,  # gsplat multiplies by it, for the mean of the views' losses; ours is their sum
-            "gaussian_ids": None,
-        }
+        return _info(result.means2d.detach(), self._gradient(result).view(-1, n, 2), result.radii, camera)
 
     def accumulate(self, result: RenderResult, camera: Camera) -> None:
         """Add to the statistics of gsplat's strategy; see `DensityControl`.
@@ -208,6 +210,27 @@ class Densifier(DensityControl):
 
     def _lower_opacities(self, model: TrainableField, highest: float) -> None:
         reset_opa(model.params, model.optimizers, self.state, value=highest)
+
+
+def _info(means2d: Tensor, gradient: Tensor, radii: Tensor, camera: Camera) -> dict[str, Any]:
+    """Return centres (b, n, 2), their gradients (b, n, 2) and radii (b, n) as gsplat's strategies expect them."""
+    n = gradient.shape[-2]
+    centres: Any = means2d.view(-1, n, 2)
+    centres.grad = centres.absgrad = gradient
+    return {
+        "means2d": centres,
+        "radii": radii.view(-1, n, 1).expand(-1, -1, 2),  # (b, n, 2)
+        "width": camera.width,
+        "height": camera.height,
+        "n_cameras": 1,  # gsplat multiplies by it, for the mean of the views' losses; ours is their sum
+        "gaussian_ids": None,
+    }
+
+
+def _nothing_shown(model: TrainableField, camera: Camera) -> dict[str, Any]:
+    """Return a render that shows no Gaussian as gsplat's strategies expect it."""
+    none = model.params["means"].detach().new_zeros(1, len(model), 2)
+    return _info(none, torch.zeros_like(none), none[..., 0].int(), camera)
 
 
 def add_gradients(

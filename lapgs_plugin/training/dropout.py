@@ -15,7 +15,7 @@ NOTHING = -20.0
 MOST_OPACITY = 0.9999
 
 
-def thinned(field: GaussianField, share: float) -> GaussianField:
+def thinned(field: GaussianField, share: float, generator: torch.Generator | None = None) -> GaussianField:
     """Return a field in which Gaussians that are drawn at random are transparent, and others more opaque.
 
     The expected opacity of each stays what it was, where that is possible. Gradients flow to what is left.
@@ -23,9 +23,11 @@ def thinned(field: GaussianField, share: float) -> GaussianField:
     Args:
         field: to thin; its other tensors are shared.
         share: of the Gaussians, from 0 to below 1.
+        generator: of random numbers, on the field's device; None for PyTorch's own.
     """
     if share == 0.0:
         return field
-    kept = torch.rand_like(field.opacity_logits) >= share
+    logits = field.opacity_logits
+    kept = torch.rand(logits.shape, generator=generator, dtype=logits.dtype, device=logits.device) >= share
     opacities = (torch.sigmoid(field.opacity_logits.clamp_min(NOTHING)) / (1.0 - share)).clamp_max(MOST_OPACITY)
     return field.with_parameters({"opacity_logits": torch.where(kept, torch.logit(opacities), NOTHING)})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -63,7 +63,7 @@ class StageEvaluation:
         with run.record.overhead.timed("evaluation"):
             learned = None if run.exposures is None else run.exposures.archived()
             exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
-            psnrs = {view.name: self._psnr(view, exposures.get(view.name)) for view in views}
+            psnrs = self._psnrs(views, exposures)
         measured = {"psnr": fmean(each.plain for each in psnrs.values())} if every else {}
         if every:
             self._last = run.counts.iteration, list(psnrs.values())
@@ -84,6 +84,13 @@ class StageEvaluation:
         views = self._last[1]
         coarser = [each.coarser for each in views if each.coarser is not None]
         run.record.write_view_psnrs([each.plain for each in views], coarser)
+
+    def _psnrs(self, views: Sequence[View], exposures: Mapping[str, Tensor] | None = None) -> dict[str, ViewPsnr]:
+        """Measure views, each on the rank that has its image, and return the figures by name in their order."""
+        prepared, exposures = self.run.prepared, exposures or {}
+        own = {view.name: self._psnr(view, exposures.get(view.name)) for view in prepared.owned(views)}
+        measured = {name: psnr for one in prepared.ranks.gathered(own) for name, psnr in one.items()}
+        return {view.name: measured[view.name] for view in views}
 
     @torch.no_grad()
     def _psnr(self, view: View, exposure: Tensor | None = None) -> ViewPsnr:
@@ -127,7 +134,7 @@ class StageEvaluation:
         last = iteration == run.stage.iterations
         with run.record.overhead.timed("evaluation"):
             fitted = run.exposures is not None
-            psnrs = [self._psnr(view) for view in aside]
+            psnrs = list(self._psnrs(aside).values())
             now = fmean(each.fitted if fitted else each.plain for each in psnrs)
             if self.best is None or now > self.best["psnr"] - (LEAST_GAIN if last else 0.0):
                 state = run.state()

@@ -146,7 +146,7 @@ class McmcDensifier(DensityControl):
         dead = opacities <= DEAD_OPACITY
         places = dead.nonzero()[:, 0]
         if 0 < len(places) < len(dead):
-            chosen = _sample(torch.where(dead, 0.0, self._demand(model)), len(places))
+            chosen = self.ranks.as_leader(_sample(torch.where(dead, 0.0, self._demand(model)), len(places)))
             model.forget_moments(_share(model, chosen))
             self._share_gradients(places, chosen)
             # What is moved keeps its moments: it was visible a moment ago, and its first steps would be long without.
@@ -162,7 +162,7 @@ class McmcDensifier(DensityControl):
         grown = max(int(self._growth * len(model)), len(model) + 1)  # 5 % of fewer than 20 Gaussians are none
         count = min(self._most, grown) - len(model)
         if count > 0:
-            chosen = _sample(self._demand(model), count)
+            chosen = self.ranks.as_leader(_sample(self._demand(model), count))
             _share(model, chosen)
             model.append(chosen)
 

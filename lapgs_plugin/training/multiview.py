@@ -56,26 +56,30 @@ def large_errors(prediction: Tensor, target: Tensor, threshold: float) -> Tensor
     return error - least > threshold * (largest - least)
 
 
-def view_scores(views: Iterable[ScoredView], coefficients: Tensor, threshold: float) -> ViewScores:
-    """Score Gaussians by some views, with one backward pass for each.
+def pixels_and_blame(views: Iterable[ScoredView], coefficients: Tensor, threshold: float) -> list[Tensor]:
+    """Return sums (n,) over some views, with one backward pass for each: of `ViewScores.pixels`, and of the blame.
 
     Args:
-        views: at least one; an iterator may render one after the other.
+        views: an iterator may render one after the other.
         coefficients: (n, 1, 3) of SH degree 0, zeros with gradients, that each `grey` was rendered from.
         threshold: see `large_errors`.
     """
     pixels = torch.zeros_like(coefficients[:, 0, 0], requires_grad=False)
-    blame, count = torch.zeros_like(pixels), 0
-    if len(coefficients) == 0:  # density control may have removed all
-        return ViewScores(pixels, blame)
-    for view in views:
+    blame = torch.zeros_like(pixels)
+    for view in views if len(coefficients) else ():  # density control may have removed all
         wrong = large_errors(view.prediction, view.target, threshold)
         # The weight of a Gaussian in a pixel is the derivative of that pixel by the Gaussian's colour.
         (by_coefficients,) = torch.autograd.grad((view.grey[0] * wrong).sum(), coefficients)
         made_up = by_coefficients[:, 0, 0] / SH_C0
         pixels += made_up
         blame += view.loss * made_up
-        count += 1
+    return [pixels, blame]
+
+
+def view_scores(pixels: Tensor, blame: Tensor, count: int) -> ViewScores:
+    """Return the scores of Gaussians by the sums of `pixels_and_blame` over so many views, at least one."""
+    if len(pixels) == 0:
+        return ViewScores(pixels, blame)
     least, largest = blame.aminmax()
     return ViewScores(pixels / count, (blame - least) / (largest - least).clamp_min(torch.finfo(blame.dtype).tiny))
 
@@ -118,10 +122,16 @@ class MultiviewDensifier(Densifier):
 
     @torch.no_grad()
     def _refine(
-        self, model: TrainableField, iteration: int, result: RenderResult, camera: Camera, scores: ViewScores | None
+        self,
+        model: TrainableField,
+        iteration: int,
+        result: RenderResult | None,
+        camera: Camera,
+        scores: ViewScores | None,
     ) -> None:
         assert scores is not None, "needed in this iteration"
-        self.accumulate(result, camera)
+        if result is not None:
+            self.accumulate(result, camera)
         state, extent = self.state, self.state["scene_scale"]
         times = state["count"].clamp_min(1)
         wanted = scores.pixels > self._options.error_pixels

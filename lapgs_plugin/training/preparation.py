@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
+import torch
+
+from lapgs_plugin import __version__
+from lapgs_plugin.errors import RunFolderError, UserInputError, counted, errors_about
 from lapgs_plugin.files import MANIFEST, one_line_errors
 from lapgs_plugin.options import option_values
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
@@ -22,10 +25,13 @@ from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import resolve_masks, share_inside
 from lapgs_plugin.scenes.options import SceneOptions
-from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.scenes.scene import Scene, View, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
 from lapgs_plugin.training.planning import make_plan, require_pruning
 from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.ranks.archive import open_for
+from lapgs_plugin.training.ranks.equality import require_same
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
@@ -58,6 +64,7 @@ class TrainRequest:
             same. A new run on few photos gets fewer iterations if they are not among them.
 
         began: when the seconds of --time began, by `time.monotonic`.
+        ranks: the processes that train it; all make the same request.
 
     Raises:
         UserInputError: two options contradict each other.
@@ -72,6 +79,7 @@ class TrainRequest:
     overwrite: bool = False
     chosen: frozenset[str] = frozenset({"iterations"})
     began: float = field(default_factory=time.monotonic)
+    ranks: Ranks = ALONE
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
@@ -98,9 +106,11 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     Raises:
         LapgsError: the request, the scene, the run folder or the machine does not allow the run.
     """
-    photos, settings = request.photos, request.settings
+    photos, settings, ranks = request.photos, request.settings, request.ranks
+    say = say if ranks.leads else _silent
+    require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
     depth = resolve_depth(Path(request.scene), settings.depth)
-    request = replace(request, settings=replace(settings, depth=depth))
+    request = replace(request, settings=replace(settings, depth=depth, ranks=max(settings.ranks, ranks.size)))
     masks = resolve_masks(Path(request.scene), photos.masks)
     reference = SceneReference(
         path=str(request.scene),
@@ -122,11 +132,13 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     out, settings = Path(request.out), request.settings
     require_room(out, request.overwrite)
     require_place(out)
-    placed = training_rasterizer(request.control.rasterizer, settings)
+    ranks, placed = request.ranks, training_rasterizer(request.control.rasterizer, settings)
     _check_busy(request.control, placed, settings)
+    ranks.use(placed.device)
 
     def decide(size: tuple[int, int], photos: int) -> None:
         nonlocal settings
+        _require_views(ranks, photos)
         if "iterations" not in request.chosen and (fewer := settings.for_photos(photos)) != settings:
             settings = fewer
             say(
@@ -139,14 +151,18 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
         settings = settings.for_size(size)
         require_pruning(make_plan(size, settings, photos), settings)
 
-    scene = load_reference(reference, decide, hold=settings.images_on != "disk")
+    scene = load_reference(reference, decide, **_reading(request, settings))
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
     depth = load_depth(scene, settings.depth, reference.images, say)
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
-    with RunArchive.create(out, manifest, request.overwrite) as archive:
-        run = PreparedRun.of(scene, settings, archive, placed, request.control, began=request.began, depth=depth)
+    _require_same_run(ranks, scene, settings)
+    with open_for(ranks, out, lambda kind: kind.create(out, manifest, request.overwrite)) as archive:
+        run = PreparedRun.of(
+            scene, settings, archive, placed, request.control, began=request.began, depth=depth, ranks=ranks
+        )
+        run = _ready(run)
         _say_about_photos(run, say)
         yield run
 
@@ -159,8 +175,9 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
     """
     settings = request.settings
     assert settings.time is not None
-    rate, seconds = views_per_second(scene, settings, placed), parse_duration(settings.time)
-    require_time_left(settings.time, spent := time.monotonic() - request.began)
+    ranks, seconds = request.ranks, parse_duration(settings.time)
+    rate = ranks.from_leader(ranks.size * views_per_second(scene, settings, placed))
+    require_time_left(settings.time, spent := ranks.from_leader(time.monotonic() - request.began))
     iterations = max(settings.levels, round(rate * (seconds - spent)))
     settings = settings.lasting(iterations, choose="strategy" not in request.chosen).for_size(scene.smallest_size)
     require_pruning(make_plan(scene.smallest_size, settings, len(scene.train)), settings)
@@ -179,7 +196,8 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
         begun = (out / MANIFEST).is_file()
     if not begun:
         raise RunFolderError(f"{out} is not a run, so there is nothing to continue; leave --resume out to start one")
-    with RunArchive.open(out, resume=True) as archive:
+    ranks = request.ranks
+    with open_for(ranks, out, lambda kind: kind.open(out, resume=True)) as archive:
         manifest, chosen = archive.manifest, request.chosen
         file = archive.path(MANIFEST)
         _require_same_folder(out, Path(manifest.scene.path), scene_folder)
@@ -196,22 +214,76 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
         _require_same(out, chosen, wanted, _options(manifest.scene, settings, manifest.rasterizer))
         changed = {name: wanted[name] for name in MAY_CHANGE if name in chosen}
         began = request.began if changed.get("time") != settings.time and "time" in changed else None
+        if settings.ranks == 1 < ranks.size:  # from here on its sums are those of ranks
+            changed["ranks"] = ranks.size
         settings = replace(settings, **changed)
         with nullcontext() if changed else errors_about(file):
             placed = training_rasterizer(manifest.rasterizer, settings)
         _check_busy(request.control, placed, settings)
+        ranks.use(placed.device)
         with errors_about(file):
-            scene = load_reference(replace(manifest.scene, path=str(scene_folder)), hold=settings.images_on != "disk")
+            here = replace(manifest.scene, path=str(scene_folder))
+            scene = load_reference(here, lambda _, photos: _require_views(ranks, photos), **_reading(request, settings))
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
             depth = load_depth(scene, settings.depth, manifest.scene.images, say)
             run = PreparedRun.of(
-                scene, settings, archive, placed, request.control, resumes=True, began=began, depth=depth
+                scene, settings, archive, placed, request.control, resumes=True, began=began, depth=depth, ranks=ranks
             )
+        _require_same_run(ranks, scene, settings)
+        run = _ready(run)
         if began is not None:
             archive.change_settings({"time": settings.time})
+        if "ranks" in changed:
+            archive.change_settings({"ranks": settings.ranks})
         _say_about_photos(run, say)
         yield run
+
+
+def _silent(_: str) -> None:
+    """Tell the user nothing: rank 0 does."""
+
+
+def _reading(request: TrainRequest, settings: TrainSettings) -> dict[str, bool]:
+    """Return how `load_reference` reads photos: of several ranks, each reads its own later."""
+    alone = request.ranks.size == 1
+    return {"hold": alone and settings.images_on != "disk", "read": alone}
+
+
+def _ready(run: PreparedRun) -> PreparedRun:
+    """Read the photos that this rank trains on, if it has not; check that every rank has a view of each step."""
+    ranks = run.ranks
+    if ranks.size == 1:
+        return run
+    fewest = min(run.schedule_of(stage).views for stage in run.plan)
+    if ranks.size > fewest:
+        raise UserInputError(
+            f"{ranks.together}: a step of this run has {counted(fewest, 'view')}, fewer than ranks; give at most so "
+            "many ranks, or more --views-per-step"
+        )
+    if run.settings.images_on == "disk":
+        return run
+    held = held_views(run.owned((*run.scene.train, *run.aside, *run.scene.test)), progress=ranks.leads)
+    by_name = {view.name: view for view in held}
+
+    def own(views: Iterable[View]) -> tuple[View, ...]:
+        return tuple(by_name.get(view.name, view) for view in views)
+
+    scene = replace(run.scene, train=own(run.scene.train), test=own(run.scene.test))
+    return replace(run, scene=scene, aside=own(run.aside))
+
+
+def _require_views(ranks: Ranks, photos: int) -> None:
+    """Refuse more ranks than training photos."""
+    if ranks.size > photos:
+        raise UserInputError(f"{ranks.together}: the scene has {photos} training photos; give at most so many ranks")
+
+
+def _require_same_run(ranks: Ranks, scene: Scene, settings: TrainSettings) -> None:
+    """Refuse ranks whose scene or settings are not those of rank 0."""
+    names = [(view.name, view.camera.size) for view in (*scene.train, *scene.test)]
+    points = len(scene.points), float(scene.points.double().sum())
+    require_same(ranks, {"photos": names, "points": points, "settings": settings.for_manifest()})
 
 
 def _require_untimed(out: Path, settings: TrainSettings, wanted: TrainSettings, asked: int | None) -> None:
@@ -244,7 +316,7 @@ def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: Tr
 def _say_about_photos(run: PreparedRun, say: Say) -> None:
     """Say the share of their pixels inside masks, and whether a CPU takes hours for so many."""
     views = (*run.scene.train, *run.aside, *run.scene.test)
-    if any(view.masked for view in views):
+    if run.ranks.leads and any(view.masked for view in views):
         share = share_inside(view.mask for view in views)
         say(f"masks ({run.archive.manifest.scene.masks}): {share:.0%} of the pixels are trained on and measured")
     size = run.plan[0].image_size

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,6 +19,7 @@ from lapgs_plugin.hierarchy.plan import Stage, level_size
 from lapgs_plugin.ops.mixed_sizes import similar_sizes
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CACHE
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.scenes.depth import DepthTargets
 from lapgs_plugin.scenes.scene import Scene, View
@@ -24,6 +28,8 @@ from lapgs_plugin.training.densification import DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import iterations_continued, make_plan
 from lapgs_plugin.training.quality import set_aside
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
+from lapgs_plugin.training.ranks.steps import WholeSteps, steps_of
 from lapgs_plugin.training.schedule import MOST_PADDING, StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.strategies import Strategy
@@ -43,6 +49,7 @@ class PreparedRun(StagedRun):
         first_field: the first stage starts from it; None starts from the scene's points.
         began: when the seconds of --time began, by `time.monotonic`; None goes on with those that are left.
         depth: of the training views; None without.
+        ranks: the processes that train it.
     """
 
     settings: TrainSettings
@@ -54,6 +61,7 @@ class PreparedRun(StagedRun):
     first_field: GaussianField | None
     began: float | None
     depth: DepthTargets | None
+    ranks: Ranks
 
     @classmethod
     def of(
@@ -68,6 +76,7 @@ class PreparedRun(StagedRun):
         first_field: GaussianField | None = None,
         began: float | None = None,
         depth: DepthTargets | None = None,
+        ranks: Ranks = ALONE,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
 
@@ -76,8 +85,8 @@ class PreparedRun(StagedRun):
             settings: of the run.
             archive: open for writing.
             placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
-            control, resumes, first_field, began, depth: see the attributes; by default the run is new, starts
-                from the points without depth, and a time begins with the training.
+            control, resumes, first_field, began, depth, ranks: see the attributes; by default the run is new, starts
+                from the points without depth, a time begins with the training, and this process trains alone.
 
         Raises:
             UserInputError: as `make_plan`.
@@ -98,6 +107,7 @@ class PreparedRun(StagedRun):
             first_field=first_field,
             began=began,
             depth=depth,
+            ranks=ranks,
         )
         # With --time their lengths were decided by the clock.
         for record in archive.manifest.records if settings.time is not None else ():
@@ -113,6 +123,31 @@ class PreparedRun(StagedRun):
     def batches(self) -> bool:
         """Whether views are rendered together; a pose's gradient needs the Gaussians' gradients of its view alone."""
         return not self.settings.refine_poses and self.rasterizer.can_batch
+
+    @property
+    def cache_folder(self) -> Path:
+        """See `StagedRun`; each rank has its own."""
+        return self.archive.path(CACHE, f"rank_{self.ranks.rank}") if self.ranks.size > 1 else super().cache_folder
+
+    def steps_of(self, stage: Stage) -> WholeSteps:
+        """Return which views the steps of a stage have, and which of them this process renders."""
+        views, settings = len(self.scene.train), self.settings
+        return steps_of(views, settings.seed, stage.level, settings.ranks, self.ranks, self.device)
+
+    @cached_property
+    def own(self) -> frozenset[str]:
+        """Names of the views whose images this rank has."""
+        trained = [
+            self.scene.train[index]
+            for part in self.steps_of(self.plan[0]).own(range(len(self.scene.train)))
+            for index in part
+        ]
+        measured = (*self.scene.test, *self.aside)[self.ranks.rank :: self.ranks.size]
+        return frozenset(view.name for view in (*trained, *measured))
+
+    def owned(self, views: Sequence[View]) -> tuple[View, ...]:
+        """Return those views whose images this rank has."""
+        return tuple(view for view in views if view.name in self.own)
 
     def size_groups(self, level: int) -> dict[tuple[int, int], int]:
         """Return the groups of the training views' sizes at a level whose views can be rendered together."""
@@ -131,7 +166,9 @@ class PreparedRun(StagedRun):
 
     def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
         """Return the density control of a stage."""
-        return control_of(self.strategy_of(stage), schedule, self.scene.extent)
+        control = control_of(self.strategy_of(stage), schedule, self.scene.extent)
+        control.ranks = self.ranks
+        return control
 
     def schedule_of(self, stage: Stage) -> StageSchedule:
         """Return the schedule of a stage."""

@@ -33,13 +33,15 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
         settings: of the run.
         stage: its image size and length decide where the settings say "auto".
         training_views: number of training views, the upper limit for "auto".
-        batches: whether the rasterizer renders several views together; "auto" is 1 where it does not.
+        batches: whether the rasterizer renders several views together; "auto" is 1 where it does not, and on several
+            ranks a multiple of their number.
     """
     asked = settings.asked_views
     if asked is None:
-        pixels = stage.image_size[0] * stage.image_size[1]
-        limits = round(PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
+        pixels, ranks = stage.image_size[0] * stage.image_size[1], settings.ranks
+        limits = round(ranks * PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
         asked = max(1, min(MOST_VIEWS, training_views, *limits)) if batches else 1
+        asked = max(ranks, asked // ranks * ranks)
     return asked
 
 

@@ -16,8 +16,9 @@ from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.profiling import Breakdown
 from lapgs_plugin.training.densification import ViewScores
 from lapgs_plugin.training.losses import ViewLosses
-from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, view_scores
+from lapgs_plugin.training.multiview import SCORED_VIEWS, ScoredView, pixels_and_blame, view_scores
 from lapgs_plugin.training.poses import ViewPoses, at_pose
+from lapgs_plugin.training.ranks.steps import WholeSteps
 from lapgs_plugin.training.views import LevelView, shuffled
 
 
@@ -33,6 +34,7 @@ class FieldScoring:
         background: (3,) behind the field.
         seed: of the run.
         breakdown: gets the time that this takes.
+        steps: of the stage, which say which rank renders a view.
     """
 
     rasterizer: Rasterizer
@@ -42,6 +44,7 @@ class FieldScoring:
     background: Tensor
     seed: int
     breakdown: Breakdown
+    steps: WholeSteps
 
     def scores(self, field: GaussianField, iteration: int, degree: int, threshold: float) -> ViewScores:
         """Score Gaussians by some training views, which are a function of the seed and the iteration.
@@ -50,10 +53,10 @@ class FieldScoring:
             field: without gradients.
             iteration: of the stage.
             degree: of the SH that are active in it.
-            threshold: as `view_scores` takes it.
+            threshold: as `pixels_and_blame` takes it.
         """
         photos, ssim_weight = self.losses.images.photos, self.losses.ssim_weight
-        chosen = shuffled(len(self.views), self.seed, self.losses.stage.level, iteration)
+        chosen = shuffled(len(self.views), self.seed, self.losses.stage.level, iteration)[:SCORED_VIEWS]
         plain, grey = _grey(field)
 
         def asked(view: LevelView) -> ScoredView:
@@ -67,13 +70,20 @@ class FieldScoring:
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view, 0), whole, target, loss)
 
-        views = (asked(self.views[index]) for index in chosen[:SCORED_VIEWS])
-        return view_scores(views, grey, threshold)
+        def summed(part: Sequence[int]) -> list[Tensor]:
+            return pixels_and_blame((asked(self.views[index]) for index in part), grey, threshold)
+
+        sums = [summed(part) for part in self.steps.own(chosen)]
+        pixels, blame = self.steps.total(sums, lambda: summed(()))
+        return view_scores(pixels, blame, len(chosen))
 
     def least_visible(self, field: GaussianField, share: float) -> Tensor:
         """Return a mask (n,) of Gaussians with negligible visibility in the training views; see `least_blended`."""
         plain, grey = _grey(field)
-        return least_blended(blended_pixels((self._render(plain, view, 0) for view in self.views), grey), share)
+        own = [self.views[index] for part in self.steps.own(range(len(self.views))) for index in part]
+        pixels = blended_pixels((self._render(plain, view, 0) for view in own), grey)
+        ranks = self.steps.ranks
+        return ranks.as_leader(least_blended(ranks.largest(pixels), share))
 
     def _render(self, field: GaussianField, view: LevelView, degree: int) -> Tensor:
         camera = at_pose(view, self.poses).camera

@@ -246,6 +246,7 @@ class TrainSettings(HierarchySettings):
         choices=(LAST, BEST),
     )
     sh_every: int | None = None  # iterations between two rises of the SH degree; None: 1000 of 30,000
+    ranks: int = 1  # that the run was started on, which its sums depend on; see `training.ranks.shards`
     extended: int = 0  # iterations of the finest stage after its schedule's end, by --resume --iterations
     ssim_weight: float = 0.2
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -263,6 +264,8 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--sh-degree {self.sh_degree}: expected 0, 1, 2 or 3")
         if not 0 <= self.extended < self.iterations:
             raise UserInputError(f"extended {self.extended}: expected 0 to below the iterations, {self.iterations}")
+        if self.ranks < 1:
+            raise UserInputError(f"ranks {self.ranks}: expected at least 1")
         if self.sh_every is not None and self.sh_every < 1:
             raise UserInputError(f"sh_every {self.sh_every}: expected at least 1")
         self._check_base()

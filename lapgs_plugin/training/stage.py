@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain, groupby
 from typing import Any
 
 import torch
@@ -33,12 +34,14 @@ from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.ranks.equality import require_equal_fields
+from lapgs_plugin.training.ranks.sums import StepSums
 from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.stage_start import joint_fields
 from lapgs_plugin.training.time_budget import StageBudget
 from lapgs_plugin.training.view_transforms import ViewTransforms
-from lapgs_plugin.training.views import LevelView, level_views, view_index
+from lapgs_plugin.training.views import LevelView, level_views
 
 FINITE_CHECK_EVERY = 100
 """Iterations between two checks of all parameters for NaN; the loss is checked in every iteration."""
@@ -54,10 +57,12 @@ class _Planned:
 
     Attributes:
         iterations: that train them, in order.
+        part: of the step, see `WholeSteps.own`.
     """
 
     iterations: Sequence[int]
     views: Sequence[LevelView]
+    part: int
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,7 @@ class StageRun:
     loss: float = math.nan
     most_views: int | None = None
     step_views: int = 1
+    _late_steps: int = 0  # whose losses are in `_unread`
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
     _following: tuple[range, list[_Planned]] | None = None  # the next step, planned while this one was run
@@ -133,6 +139,10 @@ class StageRun:
         settings = self._settings = prepared.settings
         self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
         self._views = level_views(prepared.scene.train, stage.level)
+        self._steps = prepared.steps_of(stage)
+        self._sums = StepSums(self._steps) if self._steps.shared else None
+        for learned in filter(None, self.transforms.values()):
+            learned.ranks = prepared.ranks
         self._size_groups = prepared.size_groups(stage.level) if prepared.batches else {}
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
         self._joint_from = settings.joint_from(replace(stage, iterations=self.schedule.iterations))
@@ -149,7 +159,14 @@ class StageRun:
             ssim_weight=settings.ssim_weight,
         )
         self._scoring = FieldScoring(
-            self._rasterizer, self._views, self._losses, self.poses, self.background, settings.seed, self._breakdown
+            rasterizer=self._rasterizer,
+            views=self._views,
+            losses=self._losses,
+            poses=self.poses,
+            background=self.background,
+            seed=settings.seed,
+            breakdown=self._breakdown,
+            steps=self._steps,
         )
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
@@ -161,6 +178,7 @@ class StageRun:
         Raises:
             TrainingDivergedError: the loss or a parameter became NaN or infinite.
         """
+        self.require_equal_fields()
         if self.budget is not None:
             self.budget.start(self.counts.iteration)
         while self.counts.iteration < self.stage.iterations:
@@ -172,8 +190,9 @@ class StageRun:
             self.record.pause_clock()
             self.counts.iteration += self.step_views
             if self.budget is not None:
-                self._last(self.budget.length(self.counts.iteration))
-            if len(self._unread) >= self._losses_at_once or self.counts.iteration == self.stage.iterations:
+                length = self.budget.length(self.counts.iteration)
+                self._last(self.prepared.ranks.from_leader(length))
+            if self._late_steps >= LOSSES_READ_EVERY or self.counts.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
         self._profile()
@@ -207,15 +226,22 @@ class StageRun:
         Raises:
             TrainingDivergedError: one is NaN or infinite.
         """
-        if not self._unread:
+        if not self._late_steps:
             return
+        waiting, self._unread, self._late_steps = self._unread, [], 0
+        self.catch_up()
+        losses = torch.stack([loss for loss, _, _ in waiting]).tolist() if waiting else []
+        noted = [(iteration, loss, views) for loss, (_, iteration, views) in zip(losses, waiting, strict=True)]
+        if self._steps.shared:
+            noted = sorted(chain.from_iterable(self.prepared.ranks.gathered(noted)))
+        for iteration, loss, views in noted:
+            self._note_loss(loss, iteration, views)
+
+    def catch_up(self) -> None:
+        """Wait for a GPU to finish its iterations, as part of the training time."""
         self.record.resume_clock()
-        waiting, self._unread = self._unread, []
-        losses = torch.stack([loss for loss, _, _ in waiting]).tolist()
         self.record.wait_for_device()
         self.record.pause_clock()
-        for loss, (_, iteration, views) in zip(losses, waiting, strict=True):
-            self._note_loss(loss, iteration, views)
 
     def passed(self, every: int) -> bool:
         """Return whether the last step reached or passed a multiple of `every` iterations, or the stage's end."""
@@ -262,9 +288,9 @@ class StageRun:
         return self.prepared.device
 
     @property
-    def _losses_at_once(self) -> int:
-        """Number of losses that are read together."""
-        return LOSSES_READ_EVERY if self._device.type == "cuda" else 1
+    def _reads_late(self) -> bool:
+        """Whether losses of several steps are read together."""
+        return self._steps.shared or self._device.type == "cuda"
 
     @property
     def first_view(self) -> LevelView:
@@ -276,10 +302,15 @@ class StageRun:
         return range(done + 1, done + 1 + self.schedule.views_of_step(done))
 
     def _launches(self, iterations: range) -> list[_Planned]:
-        """Group the iterations of a step into launches: views of similar sizes and one SH degree, no more than fit."""
+        """Group those iterations of a step that this rank trains into launches, see `_launches_of`."""
+        parts = enumerate(self._steps.parts(iterations))
+        return [launch for part, own in parts for launch in self._launches_of(part, own)]
+
+    def _launches_of(self, part: int, iterations: Sequence[int]) -> list[_Planned]:
+        """Group iterations into launches: views of similar sizes and one SH degree, no more than fit."""
         views = [self._view(iteration) for iteration in iterations]
         if not self.prepared.batches or len(iterations) == 1:
-            return [_Planned([iteration], [view]) for iteration, view in zip(iterations, views, strict=True)]
+            return [_Planned([iteration], [view], part) for iteration, view in zip(iterations, views, strict=True)]
         alike: dict[tuple[bool, int, int], list[int]] = {}
         for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
             degree = self.schedule.active_sh_degree(iteration)
@@ -293,7 +324,7 @@ class StageRun:
             size = math.ceil(len(group) / count)
             for start in range(0, len(group), size):
                 chosen = group[start : start + size]
-                launches.append(_Planned([iterations[i] for i in chosen], [views[i] for i in chosen]))
+                launches.append(_Planned([iterations[i] for i in chosen], [views[i] for i in chosen], part))
         return launches
 
     def _planned(self, iterations: range) -> list[_Planned]:
@@ -304,12 +335,14 @@ class StageRun:
 
     def _step(self, iterations: range) -> None:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
+        last = iterations[-1]
+        if self._sums is not None and self.joint is None and self._is_joint(last):
+            self.train_jointly(None)  # on all ranks at once, whichever of them has the first view
         launches = self._run_launches(iterations)
         self._breakdown.mark("backward")
+        self._sum_over_ranks(iterations)
         self.densifier.regularize(self.model, iterations)
-        last = iterations[-1]
-        for launch in launches:
-            self.counts.gaussian_steps += launch.gaussians * launch.views
+        self._count_gaussians(launches)
         self._breakdown.mark("other")
         context, self._context = self._context, None
         if context is not None:
@@ -327,13 +360,29 @@ class StageRun:
         for learned in filter(None, self.transforms.values()):
             learned.after_step(last, len(iterations))
         self._breakdown.mark("densification")
-        for launch in launches[:-1]:
-            if launch.result is not None:
-                self.densifier.accumulate(launch.result, launch.camera)
-        self._densify(context, last, launches[-1])
+        if self._sums is None:
+            for launch in launches[:-1]:
+                if launch.result is not None:
+                    self.densifier.accumulate(launch.result, launch.camera)
+            self._densify(context, last, launches[-1].result, launches[-1].camera)
+        else:  # statistics of all views are there
+            self._densify(context, last, None, at_pose(self._view(last), self.poses).camera)
         self._breakdown.mark("other")
         if last % FINITE_CHECK_EVERY < len(iterations) or last == self.stage.iterations:
             self.require_finite(last)
+
+    def _sum_over_ranks(self, iterations: range) -> None:
+        """Give the fields the gradients of all views of a step, and density control their statistics."""
+        if self._sums is not None:
+            needed = any(map(self.densifier.needs_statistics, iterations))
+            self._sums.give(len(self._steps.parts(iterations)), self._models, self.densifier, needed)
+
+    def _count_gaussians(self, launches: Sequence[_Launch]) -> None:
+        """Count the Gaussians of a step for each of its views."""
+        if self._sums is None:
+            self.counts.gaussian_steps += sum(launch.gaussians * launch.views for launch in launches)
+        else:
+            self.counts.gaussian_steps += self.num_optimized * self.step_views
 
     def _run_launches(self, iterations: range) -> list[_Launch]:
         """Run all launches of a step. If the GPU's memory is too small, start the step again with smaller launches."""
@@ -343,14 +392,15 @@ class StageRun:
             following = [] if is_last else self._planned(self._next(iterations[-1]))[:1]
             try:
                 thens = [*planned[1:], *following, None]
-                done = [self._launch(launch, then) for launch, then in zip(planned, thens, strict=False)]
+                done = self._run_planned(planned, thens)
             except torch.cuda.OutOfMemoryError:
                 most = max(len(launch.views) for launch in planned)
                 if most == 1:
                     raise
             else:
-                if self._losses_at_once > 1:
+                if self._reads_late:
                     self._unread += [(launch.loss, launch.iteration, launch.views) for launch in done]
+                    self._late_steps += 1
                 return done
             # Outside of `except`, because the error keeps the tensors of the render alive.
             self._forget_gradients()
@@ -361,8 +411,21 @@ class StageRun:
                 "together, and steps take as many as before"
             )
 
+    def _run_planned(self, planned: Sequence[_Planned], thens: Sequence[_Planned | None]) -> list[_Launch]:
+        """Run launches; the images of the first of `thens` are prefetched in the first one, and so on."""
+        done: list[_Launch] = []
+        for part, launches in groupby(zip(planned, thens, strict=False), key=lambda pair: pair[0].part):
+            own = [self._launch(launch, then) for launch, then in launches]
+            done += own
+            if self._sums is not None:
+                renders = [(launch.result, launch.camera) for launch in own if launch.result is not None]
+                self._sums.take(part, self._models, self.densifier, renders)
+        return done
+
     def _forget_gradients(self) -> None:
         self._context = None
+        if self._sums is not None:
+            self._sums.forget()
         for model in self._models:
             for param in model.params.values():
                 param.grad = None
@@ -387,7 +450,8 @@ class StageRun:
             self._prefetch(then)
         self._breakdown.mark("forward")
         gaussians = self.model.field
-        shown = thinned(gaussians, self._dropout * self.schedule.progress_at(last))
+        share = self._dropout * self.schedule.progress_at(last)
+        shown = thinned(gaussians, share, self._steps.generator(last, gaussians.means.device))
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
         self._breakdown.mark("loss")
@@ -396,7 +460,9 @@ class StageRun:
         kept = loss.detach()
         if result is not None:
             result = replace(result, image=kept, transmittance=None)
-        if self._losses_at_once == 1:  # on a CPU at once, before a loss that is not finite does harm
+        if self._device.type == "cpu":  # at once, before a loss that is not finite does harm
+            self._require_finite_loss(kept.item(), last)
+        if not self._reads_late:
             self._note_loss(kept.item(), last, len(views))
         self._breakdown.mark("backward")
         with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
@@ -441,7 +507,7 @@ class StageRun:
         return image, None
 
     def _view(self, iteration: int) -> LevelView:
-        return self._views[view_index(iteration, len(self._views), self._settings.seed, self.stage.level)]
+        return self._views[self._steps.view(iteration)]
 
     def _prefetch(self, planned: _Planned) -> None:
         """Copy the images of the next launch to the device while this one renders."""
@@ -451,13 +517,15 @@ class StageRun:
             for name in names:
                 self.images.predictions.prefetch(name)
 
-    def _densify(self, context: StageContext | None, iteration: int, launch: _Launch) -> None:
+    def _densify(
+        self, context: StageContext | None, iteration: int, result: RenderResult | None, camera: Camera
+    ) -> None:
         threshold = self.densifier.score_threshold(iteration)
         scores = None
         if threshold is not None:
             degree = self.schedule.active_sh_degree(iteration)
             scores = self._scoring.scores(self.model.field.detach(), iteration, degree, threshold)
-        changed = self.densifier.after_step(self.model, iteration, launch.result, launch.camera, scores)
+        changed = self.densifier.after_step(self.model, iteration, result, camera, scores)
         if (share := self._settings.prune) and iteration == self.schedule.prunes_after:
             gone = self._scoring.least_visible(self.model.field.detach(), share)
             remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
@@ -468,10 +536,13 @@ class StageRun:
 
     def _note_loss(self, loss: float, iteration: int, views: int) -> None:
         """Add the mean loss of some views to the smoothed loss; `iteration` is that of the last view."""
-        if not math.isfinite(loss):
-            raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
+        self._require_finite_loss(loss, iteration)
         kept = LOSS_SMOOTHING**views
         self.loss = loss if math.isnan(self.loss) else kept * self.loss + (1 - kept) * loss
+
+    def _require_finite_loss(self, loss: float, iteration: int) -> None:
+        if not math.isfinite(loss):
+            raise self._diverged(f"the loss is {loss}, expected a finite number", iteration)
 
     def require_finite(self, iteration: int) -> None:
         """Raise a TrainingDivergedError that names an iteration if a field under training has NaN or inf."""
@@ -479,6 +550,11 @@ class StageRun:
             require_finite(self.fields, self.stage.level)
         except FieldError as error:
             raise self._diverged(str(error), iteration) from error
+
+    def require_equal_fields(self) -> None:
+        """Raise a RanksDifferError if the ranks' fields have come apart."""
+        where = f"level {self.stage.level}, iteration {self.counts.iteration}"
+        require_equal_fields(self.prepared.ranks, self._models, where)
 
     def _diverged(self, problem: str, iteration: int) -> TrainingDivergedError:
         return TrainingDivergedError(

@@ -18,7 +18,7 @@ from lapgs_plugin.runs.image_store import eight_bit_levels
 from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
-from lapgs_plugin.scenes.exposure import measure_exposure
+from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
@@ -68,9 +68,9 @@ def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, An
 
 def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
     """Return the images of a stage with the photos of its training views, on a CPU as float32."""
-    views, on_gpu = run.scene.train, run.device.type == "cuda"
+    views, on_gpu = run.owned(run.scene.train), run.device.type == "cuda"
     eight_bit = on_gpu and stage.level == 0 and all(eight_bit_levels(view.image) is not None for view in views)
-    masked = any(view.masked for view in views)
+    masked = any(view.masked for view in run.scene.train)  # on every rank or on none
     images = StageImages(run, stage, sizes_of(views), eight_bit=eight_bit, masked=masked, exact=not on_gpu)
     for view in views:
         images.photos.put(view.name, view.image, view.mask)
@@ -89,10 +89,10 @@ def predict_views(run: PreparedRun, stage: Stage, images: StageImages, overhead:
 
     where = run.settings.images_on
     with overhead.timed("cache"):
-        images.predictions = cached(run.scene.train, "train", where)
+        images.predictions = cached(run.owned(run.scene.train), "train", where)
     # Held-out views are rarely used, outside the clock: a GPU needs its memory for others.
     with overhead.timed("evaluation"):
-        images.held_out = cached((*run.scene.test, *run.aside), "test", "memory" if where == AUTO else where)
+        images.held_out = cached(run.owned((*run.scene.test, *run.aside)), "test", "memory" if where == AUTO else where)
 
 
 def sizes_of(views: Sequence[View]) -> dict[str, tuple[int, int]]:
@@ -129,7 +129,7 @@ def stage_depth(run: PreparedRun, stage: Stage) -> StageDepth | None:
     """Return the supervision of depth in a stage; None without depth, and for a residual, which has none."""
     if run.depth is None or stage.signed:
         return None
-    cameras = {view.name: view.camera for view in level_views(run.scene.train, stage.level)}
+    cameras = {view.name: view.camera for view in level_views(run.owned(run.scene.train), stage.level)}
     return StageDepth.create(run.depth, cameras, run.rasterizer, run.device)
 
 
@@ -158,7 +158,13 @@ def _measured_exposures(run: PreparedRun, monitor: Monitor) -> Tensor | None:
     choice = run.settings.exposure
     if choice == OFF or not run.supervision.composes:
         return None
-    measured = measure_exposure(run.scene)
+
+    def look_up(points: Tensor) -> list[tuple[Tensor, Tensor]]:
+        own = {view.name: colors_at(view, points) for view in run.owned(run.scene.train)}
+        seen = {name: colors for one in run.ranks.gathered(own) for name, colors in one.items()}
+        return [seen[view.name] for view in run.scene.train]
+
+    measured = measure_exposure(run.scene, look_up)
     spread, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
     if choice == AUTO and not differ:
         return None

@@ -151,6 +151,9 @@ class Trainer:
             say(f"{len(scene.train)} training views are few: --dropout {share:g} leaves Gaussians out at random")
         for level in unpruned_levels(self.prepared.plan, settings):
             say(unpruned_line(settings.prune, level))
+        if (ranks := self.prepared.ranks).size > 1:
+            views = [str(self.prepared.schedule_of(stage).views) for stage in self.prepared.plan]
+            say(f"{ranks.together}: {' and '.join(views)} views a step are shared out, coarsest level first")
         if settings.refine_poses and self.prepared.device.type == "cuda":
             say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 

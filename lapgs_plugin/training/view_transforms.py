@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 import torch
 
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
+
 BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
 
@@ -20,10 +22,13 @@ class ViewTransforms(ABC):
     Gradients are added up over one pass through all views; then Adam steps, and `_recentre` sets the transforms' mean
     back. The logarithm of the step size decays linearly over the run.
 
+    Several ranks all hold all transforms, since their mean is set back, and sum the gradients once in a pass.
+
     Attributes:
         names: of the views.
         transforms: (v, ...) parameter, on the training device.
         done, total: iterations of the run before this stage, and of all stages, for the step size.
+        ranks: that train the views.
     """
 
     STARTS_AT: ClassVar[float] = 0.0
@@ -33,6 +38,7 @@ class ViewTransforms(ABC):
     transforms: torch.nn.Parameter  # (v, ...)
     done: int
     total: int
+    ranks: Ranks = field(init=False, repr=False, default=ALONE)
     _index: dict[str, int] = field(init=False, repr=False)
     _adam: torch.optim.Adam = field(init=False, repr=False)
 
@@ -64,6 +70,7 @@ class ViewTransforms(ABC):
             return
         first, last = self._rates
         self._adam.param_groups[0]["lr"] = first * (last / first) ** progress
+        self.transforms.grad = self.ranks.sum_of(self.transforms.grad, self.transforms)
         self._step()
 
     def _step(self) -> None:
@@ -84,7 +91,7 @@ class ViewTransforms(ABC):
         """Return everything needed to continue to the same bits."""
         return {
             "transforms": self.transforms.detach(),
-            "gradient": self.transforms.grad,
+            "gradient": self.ranks.sum_of(self.transforms.grad, self.transforms),
             "moments": dict(self._adam.state[self.transforms]),
         }
 
@@ -93,7 +100,8 @@ class ViewTransforms(ABC):
         device = self.transforms.device
         with torch.no_grad():
             self.transforms.copy_(state["transforms"])
-        self.transforms.grad = None if state["gradient"] is None else state["gradient"].to(device, copy=True)
+        gradient = state["gradient"] if self.ranks.leads else None  # the sum over all ranks
+        self.transforms.grad = None if gradient is None else gradient.to(device, copy=True)
         if moments := state["moments"]:
             self._adam.state[self.transforms] = {
                 key: value.clone() if key == "step" else value.to(device, copy=True) for key, value in moments.items()

@@ -77,6 +77,6 @@ def test_an_extension_leaves_out_as_many_as_the_end_of_the_run(tmp_path: Path, m
     scene, shares = ring_scene(train=4, test=1), list[float]()
     settings = TrainSettings(iterations=12, levels=1, sh_degree=0, densification=MCMC)
     train(tmp_path / "run", scene, settings)
-    monkeypatch.setattr(stage, "thinned", lambda field, share: shares.append(share) or thinned(field, share))
+    monkeypatch.setattr(stage, "thinned", lambda field, share, _: shares.append(share) or thinned(field, share))
     resume(tmp_path / "run", scene, replace(settings, iterations=16, extended=4))
     assert shares == [0.2] * 4

@@ -24,6 +24,7 @@ from lapgs_plugin.training.multiview import (
     ScoredView,
     ViewScores,
     large_errors,
+    pixels_and_blame,
     view_scores,
 )
 from lapgs_plugin.training.schedule import StageSchedule
@@ -70,7 +71,7 @@ def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_ar
         ScoredView(rasterizer(plain, camera, background=torch.zeros(3)).image, *pair, loss)
         for camera, *pair, loss in zip(cameras, predicted, target, losses, strict=True)
     )
-    scores = view_scores(views, grey, 0.5)
+    scores = view_scores(*pixels_and_blame(views, grey, 0.5), len(cameras))
     made_up = torch.zeros(len(cameras), 30, dtype=torch.float64)
     for index in range(30):
         white = torch.zeros(30, 1, 3)
@@ -90,7 +91,7 @@ def test_scores_are_the_pixels_of_an_image_of_one_white_gaussian_where_errors_ar
 
 
 def test_a_field_without_gaussians_has_no_scores() -> None:
-    scores = view_scores(iter(()), torch.zeros(0, 1, 3, requires_grad=True), 0.1)
+    scores = view_scores(*pixels_and_blame(iter(()), torch.zeros(0, 1, 3, requires_grad=True), 0.1), 1)
     assert scores.pixels.shape == scores.blame.shape == (0,)
 
 
@@ -217,14 +218,14 @@ def test_scores_of_a_residual_are_of_the_composed_image(tmp_path: Path, monkeypa
     seen: list[Tensor] = []
     import lapgs_plugin.training.scoring as module
 
-    def noted(views: Any, grey: Tensor, threshold: float) -> ViewScores:
+    def noted(views: Any, grey: Tensor, threshold: float) -> list[Tensor]:
         listed = list(views)
         seen.extend(view.prediction - view.target for view in listed)
-        return view_scores(listed, grey, threshold)
+        return pixels_and_blame(listed, grey, threshold)
 
     density = Densification(start=0, until=80, every=1, strategy="multiview", options=Multiview(error_pixels=1e6))
     settings = TrainSettings(iterations=40, split="39/40,1/40", hierarchy="laplacian", densification=density)
-    monkeypatch.setattr(module, "view_scores", noted)
+    monkeypatch.setattr(module, "pixels_and_blame", noted)
     monkeypatch.setattr(StageSchedule, "late_prunes", frozenset())
     train(tmp_path / "run", ring_scene(), settings)
     errors = [float(difference.abs().mean()) for difference in seen if difference.shape[-1] == 56]

@@ -1,0 +1,1 @@
+"""Share the views of each step out over several processes, the ranks of a run."""

@@ -1,0 +1,77 @@
+"""Check that all ranks train the same: the same version, scene and settings, and fields of the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from lapgs_plugin.errors import LapgsError, UserInputError
+from lapgs_plugin.training.model import TrainableField
+from lapgs_plugin.training.ranks.group import Ranks
+
+
+class RanksDifferError(LapgsError):
+    """Ranks have fields of different bits: a fault of the machine or of this program."""
+
+
+def require_same(ranks: Ranks, values: Mapping[str, Any]) -> None:
+    """Refuse ranks that were started for something else than rank 0.
+
+    Args:
+        ranks: the group.
+        values: of this rank, by what they are in the message.
+
+    Raises:
+        UserInputError: a value of a rank is not that of rank 0.
+    """
+    first, *others = ranks.gathered(dict(values))
+    for rank, theirs in enumerate(others, start=1):
+        for name, value in first.items():
+            if theirs[name] != value:
+                raise UserInputError(
+                    f"rank {rank} has other {name} than rank 0 ({_difference(theirs[name], value)}); start all ranks "
+                    "with the same command, on machines with the same files and packages"
+                )
+
+
+def _difference(theirs: Any, ours: Any) -> str:
+    """Return the first entry in which two values differ, or the values."""
+    if isinstance(ours, Mapping):
+        name = next(name for name in {**ours, **theirs} if theirs.get(name) != ours.get(name))
+        return f"{name}: {theirs.get(name)} and {ours.get(name)}"
+    if isinstance(ours, list) and len(ours) == len(theirs):
+        return next(f"{one} and {other}" for one, other in zip(theirs, ours, strict=True) if one != other)
+    return f"{len(theirs)} and {len(ours)}" if isinstance(ours, list) else f"{theirs} and {ours}"
+
+
+def digest(models: Sequence[TrainableField]) -> tuple[int, ...]:
+    """Return numbers that differ, but for a rare chance, if a bit of a field's parameters does."""
+    sums = []
+    for param in (param for model in models for param in model.params.values()):
+        bits = param.detach().reshape(len(param), -1).view(torch.int32)
+        sums += [bits.sum(dtype=torch.int64), bits[::2].sum(dtype=torch.int64), bits[:, ::2].sum(dtype=torch.int64)]
+    return tuple(torch.stack(sums).tolist())
+
+
+def require_equal_fields(ranks: Ranks, models: Sequence[TrainableField], where: str) -> None:
+    """Refuse to go on with fields that are not the same on all ranks.
+
+    Args:
+        ranks: the group.
+        models: the fields under training, on each rank.
+        where: level and iteration, for the message.
+
+    Raises:
+        RanksDifferError: they are not.
+    """
+    if ranks.size == 1:
+        return
+    first, *others = ranks.gathered((len(models[0]), digest(models)))
+    for rank, theirs in enumerate(others, start=1):
+        if theirs != first:
+            raise RanksDifferError(
+                f"{where}: the field of rank {rank} is not that of rank 0 ({theirs[0]:,} and {first[0]:,} Gaussians); "
+                "the last checkpoint continues with --resume"
+            )

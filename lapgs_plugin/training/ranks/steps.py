@@ -1,0 +1,123 @@
+"""Say which views a step of a stage has, which of them this rank renders, and how their sums are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
+from lapgs_plugin.training.ranks.shards import epoch_order, shards_of, tree_sum
+from lapgs_plugin.training.views import view_index
+
+
+@dataclass(frozen=True)
+class WholeSteps:
+    """Train every view of a step here, in the order of the epoch.
+
+    Attributes:
+        views: number of training views.
+        seed, level: of the run and the stage.
+    """
+
+    views: int
+    seed: int
+    level: int
+
+    shared = False
+    """Whether sums over views are made by shards."""
+
+    @property
+    def ranks(self) -> Ranks:
+        """The processes that train the run."""
+        return ALONE
+
+    def view(self, iteration: int) -> int:
+        """Return the index of the view that an iteration, from 1, trains."""
+        return view_index(iteration, self.views, self.seed, self.level)
+
+    def own(self, views: Sequence[int]) -> list[list[int]]:
+        """Return the parts of some views that are summed one after the other here, each by itself."""
+        return [list(views)]
+
+    def parts(self, iterations: Sequence[int]) -> list[list[int]]:
+        """Return the parts of some iterations, by their views; see `own`."""
+        return [list(iterations)]
+
+    def total(self, parts: Sequence[Sequence[Tensor] | None], zeros: Callable[[], list[Tensor]]) -> list[Tensor]:
+        """Return the sums over the views of all ranks.
+
+        Args:
+            parts: sums of the tensors over the views of each part of `own`, written to; None for none.
+            zeros: makes the tensors of no view.
+        """
+        total = tree_sum(parts)
+        return zeros() if total is None else total
+
+    def generator(self, iteration: int, device: torch.device) -> torch.Generator | None:
+        """Return the random numbers of an iteration; None for those of the process."""
+        return None
+
+
+@dataclass(frozen=True)
+class SharedSteps(WholeSteps):
+    """Train those views of a step that this rank owns, so that every number of ranks makes the same sums.
+
+    Attributes:
+        shards: of the views, see `ranks.shards`.
+        group: the ranks.
+        exact: sum each shard by itself, for the same bits on any number of ranks; where rendering is not
+            reproducible to the bit, one part has all views.
+    """
+
+    shards: int
+    group: Ranks
+    exact: bool
+
+    shared = True
+
+    @property
+    def ranks(self) -> Ranks:
+        return self.group
+
+    def view(self, iteration: int) -> int:
+        epoch, position = divmod(iteration - 1, self.views)
+        return epoch_order(self.views, self.seed, self.level, epoch, self.shards)[position]
+
+    def own(self, views: Sequence[int]) -> list[list[int]]:
+        return self._by_shard(views, views)
+
+    def parts(self, iterations: Sequence[int]) -> list[list[int]]:
+        return self._by_shard(iterations, [self.view(iteration) for iteration in iterations])
+
+    def _by_shard(self, items: Sequence[int], views: Sequence[int]) -> list[list[int]]:
+        """Return those items whose views this rank owns, by the views' shards."""
+        shards = range(self.group.rank, self.shards, self.group.size)
+        parts = [
+            [item for item, view in zip(items, views, strict=True) if view % self.shards == shard] for shard in shards
+        ]
+        return parts if self.exact else [[item for item in items if any(item in part for part in parts)]]
+
+    def total(self, parts: Sequence[Sequence[Tensor] | None], zeros: Callable[[], list[Tensor]]) -> list[Tensor]:
+        return self.group.sum(super().total(parts, zeros))
+
+    def generator(self, iteration: int, device: torch.device) -> torch.Generator | None:
+        draw = (self.seed * 1_000_003 + self.level) * 1_000_003 + iteration
+        return torch.Generator(device).manual_seed(draw % 2**63)
+
+
+def steps_of(views: int, seed: int, level: int, started_on: int, ranks: Ranks, device: torch.device) -> WholeSteps:
+    """Return the steps of a stage.
+
+    Args:
+        views: number of training views.
+        seed, level: of the run and the stage.
+        started_on: number of ranks that the run was started on, which decides its sums.
+        ranks: that train it now.
+        device: of training.
+    """
+    if started_on == 1:
+        return WholeSteps(views, seed, level)
+    return SharedSteps(views, seed, level, shards_of(started_on), ranks, exact=device.type == "cpu")

@@ -1,0 +1,210 @@
+"""Runs on several ranks, on gloo: the same bits as in one process, and one line whatever happens to a rank."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lapgs_plugin.cli.app import app
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import CHECKPOINT, HISTORY
+from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.training.preparation import TrainRequest, prepare
+from lapgs_plugin.training.ranks.group import ALONE
+from lapgs_plugin.training.ranks.shards import epoch_order, tree_sum
+from lapgs_plugin.training.settings import Densification, TrainSettings
+from lapgs_plugin.training.strategies import Gradients
+from lapgs_plugin.training.trainer import Trainer
+from tests import ranks
+from tests.cli.commands import succeeding
+from tests.cli.run_folder import write_scene
+from tests.refusals import refuses
+from tests.training_runs import plys
+from tests.waiting import wait_for
+
+pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="needs PyTorch with gloo")
+
+TIMEOUT = 600.0
+"""Seconds until a command counts as stuck; a busy machine takes a hundred times as long as an idle one."""
+OPTIONS: Sequence[object] = (
+    *("--iterations", 400, "--levels", 2, "--strategy", "3dgs", "--densify-every", 20, "--sh-degree", 1, "--eval"),
+    *("--views-per-step", 4, "--checkpoint-every", 40),
+)
+SETTINGS = TrainSettings(
+    iterations=400,
+    levels=2,
+    sh_degree=1,
+    views_per_step="4",
+    densification=Densification(strategy="3dgs", options=Gradients(), every=20),
+    ranks=2,
+)
+"""What `OPTIONS` asks of two ranks."""
+
+
+def figures(archive: RunArchive) -> list[dict[str, Any]]:
+    """The history without times."""
+    return [
+        {name: value for name, value in entry.items() if name not in ("elapsed", "rate")} for entry in archive.history()
+    ]
+
+
+def command(*words: object) -> subprocess.Popen[str]:
+    """Start `lapgs` with some arguments."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "lapgs_plugin", *map(str, words)],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def errors(output: str) -> list[str]:
+    """Lines of an output that tell of an end before the time."""
+    words = ("lapgs:", "Error", "Traceback", "death signal", "failed", "Warning")
+    return [line for line in output.splitlines() if any(word in line for word in words)]
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    """Process ids of the ranks of a command, the last one last."""
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="ascii")
+    return sorted(map(int, listed.split()))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """Fields of the run that one process trains as two ranks would."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    request = TrainRequest(scene, out, SETTINGS, SceneOptions(eval=True))
+    with prepare(request) as run:
+        Trainer(run).run()
+    return plys(RunArchive.open(out))
+
+
+def test_two_ranks_train_to_the_bits_of_one_process(tmp_path: Path) -> None:
+    pair = ranks.start("tests.ranks", [[tmp_path / "two", *ranks.CASES]] * 2)
+    for name in ranks.CASES:
+        (tmp_path / "one").mkdir(exist_ok=True)
+        ranks.train(tmp_path / "one" / name, name, ALONE)
+    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in pair]
+    assert [process.returncode for process in pair] == [0, 0], outputs
+    for name in ranks.CASES:
+        one, two = (RunArchive.open(tmp_path / kind / name) for kind in ("one", "two"))
+        assert plys(one) == plys(two), name
+        assert figures(one) == figures(two), name
+
+
+def test_a_run_that_is_stopped_and_killed_ends_with_the_bits_of_one_that_is_not(
+    scene: Path, whole: list[bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = ["train", scene, "-o", out, *OPTIONS]
+
+    on_two = command(*words, "--processes", 2)
+    wait_for(lambda: on_two.poll() is not None or (out / HISTORY).exists(), TIMEOUT)
+    on_two.send_signal(signal.SIGTERM)
+    output, _ = on_two.communicate(timeout=TIMEOUT)
+    assert on_two.returncode == 143, output
+    (line,) = errors(output)
+    assert "a checkpoint is in" in line
+
+    written = (out / CHECKPOINT).stat().st_mtime_ns
+    on_four = command(*words, "--resume", "--processes", 4)
+    wait_for(lambda: on_four.poll() is not None or (out / CHECKPOINT).stat().st_mtime_ns > written, TIMEOUT)
+    os.kill(children(on_four)[-1], signal.SIGKILL)
+    began = time.monotonic()
+    output, _ = on_four.communicate(timeout=TIMEOUT)
+    assert time.monotonic() - began < 30.0
+    assert on_four.returncode == 1, output
+    (line,) = errors(output)
+    assert "rank 3 of 4" in line
+    assert "SIGKILL" in line
+    assert "--resume" in line
+
+    on_one = command(*words, "--resume")
+    output, _ = on_one.communicate(timeout=TIMEOUT)
+    assert on_one.returncode == 0, output
+    assert plys(RunArchive.open(out)) == whole
+
+
+def test_ranks_of_different_runs_are_refused_by_rank_0_alone(scene: Path, tmp_path: Path) -> None:
+    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
+    pair = ranks.start("lapgs_plugin", [words, [*words, "--seed", 7]])
+    first, second = (process.communicate(timeout=TIMEOUT)[0] for process in pair)
+    assert [process.returncode for process in pair] == [2, 2]
+    (line,) = errors(first)
+    assert "rank 1 has other settings than rank 0 (seed: 7 and 0)" in line
+    assert errors(second) == []
+    assert not (tmp_path / "run").exists()
+
+
+def test_ranks_whose_fields_differ_do_not_go_on(tmp_path: Path) -> None:
+    pair = ranks.start("tests.ranks", [[tmp_path, ranks.DIFFERENT]] * 2)
+    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in pair]
+    for process, output in zip(pair, outputs, strict=True):
+        assert process.returncode != 0
+        assert "level 0, iteration 0: the field of rank 1 is not that of rank 0" in output
+
+
+def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene", [f"{number}.png" for number in range(2)])
+    three = ranks.start("lapgs_plugin", [["train", scene, "-o", tmp_path / "run", "--iterations", 20]] * 3)
+    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in three]
+    assert [process.returncode for process in three] == [2, 2, 2]
+    (line,) = errors("".join(outputs))
+    assert "3 ranks: the scene has 2 training photos" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "facts"),
+    [
+        (["--gpus", 2, "--rasterizer", "cpu"], "--gpus 2 with --rasterizer cpu: that trains on a CPU"),
+        (["--gpus", 2, "--processes", 2], "--gpus 2 with --processes 2: give one of them"),
+        pytest.param(
+            ["--gpus", 2],
+            "--gpus 2: this machine has no CUDA devices",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU"),
+        ),
+    ],
+)
+def test_options_that_cannot_be_had_are_refused(words: Sequence[object], facts: str, scene: Path) -> None:
+    refuses(UserInputError, facts, succeeding(app, 200), "train", scene, "-o", scene / "run", *words)
+
+
+@given(st.integers(1, 40), st.integers(1, 16), st.integers(0, 5))
+def test_an_epoch_has_every_view_once_and_shards_in_turn(count: int, shards: int, epoch: int) -> None:
+    order = epoch_order(count, 0, 0, epoch, shards)
+    assert sorted(order) == list(range(count))
+    assert [view % shards for view in order] == [position % shards for position in range(count)]
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 8])
+def test_sums_of_shards_do_not_depend_on_the_number_of_ranks(size: int) -> None:
+    values = torch.randn(8, 1000, generator=torch.Generator().manual_seed(0))
+
+    def total(owned: list[int]) -> torch.Tensor:
+        sums = tree_sum([[values[shard].clone()] for shard in owned])
+        assert sums is not None
+        return sums[0]
+
+    of_ranks = [[total(list(range(rank, 8, size)))] for rank in range(size)]
+    together = tree_sum(of_ranks)
+    assert together is not None
+    assert torch.equal(together[0], total(list(range(8))))
