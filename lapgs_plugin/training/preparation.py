@@ -129,10 +129,11 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
 @contextmanager
 def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iterator[PreparedRun]:
     """Yield a new run."""
-    out, settings = Path(request.out), request.settings
-    require_room(out, request.overwrite)
-    require_place(out)
-    ranks, placed = request.ranks, training_rasterizer(request.control.rasterizer, settings)
+    out, settings, ranks = Path(request.out), request.settings, request.ranks
+    if ranks.leads:  # others would see the folder that it makes to try, and takes away
+        require_room(out, request.overwrite)
+        require_place(out)
+    placed = training_rasterizer(request.control.rasterizer, settings)
     _check_busy(request.control, placed, settings)
     ranks.use(placed.device)
 
