@@ -10,7 +10,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lapgs_bench.pareto.page import draw_charts
+from lapgs_bench.experiments.figures.image import draw_charts
 from lapgs_plugin.reports.charts import Chart, Frame, Series, count_text, draw_lines
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,6 +19,8 @@ from lapgs_bench.experiments.standard import DATASETS, PaperFigure, PaperTable
 from lapgs_plugin.errors import RunFolderError, UserInputError, nearest
 from lapgs_plugin.untrusted import shortened
 
+PRINTED = "As printed"
+"""Section of rows that are only printed, in tables with sections."""
 LEVELS = "_level_"
 """End of a source that stands for one column for each level."""
 TIMES = ("minutes", "train_seconds", "iteration_ms")
@@ -168,6 +170,8 @@ def check_table(experiment: Experiment) -> PaperTable | None:
         if column not in COLUMNS:
             raise UserInputError(f"table.columns: {column!r} is not known; {nearest(column, COLUMNS.keys())}")
     if experiment.table.paper is None:
+        if experiment.table.printed:
+            raise UserInputError("table.printed: there is no table.paper whose rows these are; give it")
         return None
     paper = PaperTable(experiment.table.paper)
     for variant in experiment.variants:
@@ -178,6 +182,11 @@ def check_table(experiment: Experiment) -> PaperTable | None:
                     f"variant {variant.name!r}: the paper's table {paper.name} has no row {name!r}; "
                     f"{nearest(name, paper.rows)}"
                 )
+    for name in experiment.table.printed:
+        if name not in paper.rows:
+            raise UserInputError(
+                f"table.printed: the paper's table {paper.name} has no row {name!r}; {nearest(name, paper.rows)}"
+            )
     return paper
 
 
@@ -246,8 +255,8 @@ class _GroupBuilder:
 
     def group(self, title: str | None = None) -> Group:
         cells = {key: self._cells(key) for key in self._keys}
-        rows = tuple(self._row(key, cells) for key in self._keys)
-        return Group(title or self._title(), rows, tuple(self._notes(cells)))
+        rows = *(self._row(key, cells) for key in self._keys), *map(self._printed_row, self._experiment.table.printed)
+        return Group(title or self._title(), rows, tuple(self._notes(rows)))
 
     def _title(self) -> str:
         if not self._dataset:
@@ -260,12 +269,13 @@ class _GroupBuilder:
         # Only seeds that have all compared scenes.
         complete = [[one[s] for s in self._common] for one in self._rows[key].values() if {*self._common} <= one.keys()]
         rows = complete if self._common else []
+        printed = self._variants[key[1]].paper_row(key[0])
         return {
-            name: _cell(rows, COLUMNS[name], self._paper_figure(key, name)) for name in self._experiment.table.columns
+            name: _cell(rows, COLUMNS[name], self._paper_figure(printed, name))
+            for name in self._experiment.table.columns
         }
 
-    def _paper_figure(self, key: RowKey, column: str) -> PaperFigure | None:
-        row = self._variants[key[1]].paper_row(key[0])
+    def _paper_figure(self, row: str, column: str) -> PaperFigure | None:
         if self._paper is None or not row:
             return None
         return self._paper.figure(self._dataset, self._common or self._scenes, row, column)
@@ -284,13 +294,25 @@ class _GroupBuilder:
             is_baseline=key == base,
         )
 
-    def _notes(self, cells: Mapping[RowKey, Mapping[str, Cell]]) -> list[str]:
+    def _printed_row(self, name: str) -> TableRow:
+        """Return a row of the paper's figures alone."""
+        cells = {column: Cell(paper=self._paper_figure(name, column)) for column in self._experiment.table.columns}
+        return TableRow(
+            label=f"{name} (printed only)",
+            section=PRINTED if any(variant.section for variant in self._experiment.variants) else "",
+            cells=cells,
+            speedup=Ratio(None, None),
+            psnr_gain=Ratio(None, None),
+            is_baseline=False,
+        )
+
+    def _notes(self, rows: Sequence[TableRow]) -> list[str]:
         notes = []
         if self._missing:
             notes.append(f"{self._missing} of {self._total} runs are missing.")
         if self._common and len(self._common) < len(self._scenes):
             notes.append(f"Means over {', '.join(self._common)}: the scenes that every row has.")
-        printed = [cell.paper for row in cells.values() for cell in row.values() if cell.paper is not None]
+        printed = [cell.paper for row in rows for cell in row.cells.values() if cell.paper is not None]
         if any(not figure.exact for figure in printed):
             whole = len(DATASETS[self._dataset].scenes)
             notes.append(f"The paper's figures are means over all {whole} scenes of {DATASETS[self._dataset].title}.")

@@ -23,7 +23,6 @@ from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.untrusted import STRICT
 
 LAPGS = (sys.executable, "-m", "lapgs_plugin")
-SCRIPT = "train.py"
 IMPORTED = "lapgs"
 """Folder inside a bare run's folder where `lapgs import-run` writes the run that `lapgs eval` reads."""
 NEVER = "-1"
@@ -68,16 +67,17 @@ class Locations:
             )
         return folder
 
-    def checkout(self, name: str) -> Path:
-        """Find the folder of a backbone's checkout.
+    def checkout(self, name: str, script: str) -> Path:
+        """Find the folder of a backbone's checkout with a training script.
 
         Raises:
             UserInputError: its folder is not given, or has no training script.
         """
-        folder = self._require_folder(f"checkout {name}", self._find(name), [name])
-        if not (folder / SCRIPT).is_file():
+        otherwise = ", or choose other backbones with --backbone"
+        folder = self._require_folder(f"checkout {name}", self._find(name), [name], otherwise)
+        if not (folder / script).is_file():
             raise UserInputError(
-                f"checkout {name}: {folder} has no {SCRIPT}; give its folder with --path {name}=FOLDER"
+                f"checkout {name}: {folder} has no {script}; give its folder with --path {name}=FOLDER"
             )
         return folder
 
@@ -86,8 +86,8 @@ class Locations:
         return self._folders.get(name, None if variable is None else Path(variable))
 
     @staticmethod
-    def _require_folder(name: str, folder: Path | None, keys: Iterable[str]) -> Path:
-        ways = " or ".join(f"--path {key}=FOLDER ({_environment_variable(key)})" for key in keys)
+    def _require_folder(name: str, folder: Path | None, keys: Iterable[str], otherwise: str = "") -> Path:
+        ways = " or ".join(f"--path {key}=FOLDER ({_environment_variable(key)})" for key in keys) + otherwise
         if folder is None:
             raise UserInputError(f"{name}: its folder is not given; give {ways}")
         if not is_folder(folder):
@@ -165,7 +165,7 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
 
 def _script(spec: RunSpec, scene: Path, checkout: Path, folder: Path) -> tuple[str, ...]:
     return (
-        *(str(checkout / SCRIPT), "-s", str(scene), "-i", spec.images, "-m", str(folder), "--eval"),
+        *(str(checkout / spec.script), "-s", str(scene), "-i", spec.images, "-m", str(folder), "--eval"),
         *("-r", _backbone_resolution(spec, scene)),
         *("--test_iterations", NEVER, "--checkpoint_iterations", NEVER, "--save_iterations", str(spec.iterations)),
         *_schedule(spec.iterations),

@@ -55,18 +55,19 @@ def prepare(
 
                 check_sample_scene(*parse_size(scene.sample.size), scene.sample.views, scene.sample.points)
                 where[scene.name] = scene, _sample_folder(scene.name, scene.sample, folder)
-    checkouts: dict[str, Path] = {}
-    for name, key in {run.spec.checkout: run.spec.backbone for run in planned if run.spec.checkout}.items():
+    checkouts: dict[tuple[str, str], Path] = {}
+    used = {(run.spec.checkout, run.spec.script): run.spec.backbone for run in planned if run.spec.checkout}
+    for (name, script), key in used.items():
         with mistakes.at(f"backbones.{key}.checkout"):
-            checkouts[name] = places.checkout(name)
+            checkouts[name, script] = places.checkout(name, script)
     jobs: dict[str, Job] = {}
     for run in planned:
         spec = run.spec
-        if spec.checkout is not None and (spec.scene not in where or spec.checkout not in checkouts):
+        if spec.checkout is not None and (spec.scene not in where or (spec.checkout, spec.script) not in checkouts):
             continue
         with mistakes.at(mistakes.keys_of(run)["resolution"]):
             own = folder.absolute() / RUNS / spec.run_id
-            checkout = checkouts[spec.checkout] if spec.checkout else None
+            checkout = checkouts[spec.checkout, spec.script] if spec.checkout else None
             scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
             steps = run_steps(spec, scene_folder, checkout, own, evaluate)
             log = str(folder.absolute() / LOGS / f"{spec.run_id}.log")

@@ -11,7 +11,7 @@ from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar, TypeVar
 
-from lapgs_bench.experiments.schema import OF_BARE_RUNS, Backbone, Experiment, SampleScene, Scenes, Variant
+from lapgs_bench.experiments.schema import OF_BARE_RUNS, SCRIPT, Backbone, Experiment, SampleScene, Scenes, Variant
 from lapgs_bench.experiments.settings import Selection
 from lapgs_bench.experiments.standard import DATASETS, PRESETS
 from lapgs_plugin.errors import UserInputError, nearest
@@ -45,6 +45,7 @@ class RunSpec:
 
     Attributes:
         rasterizer, checkout: one of the two, see `schema.Backbone`.
+        script: of the checkout.
         method: "hierarchy" or "bare".
         options: of `lapgs train` or `lapgs run`.
         arguments: of the checkout's script.
@@ -66,11 +67,15 @@ class RunSpec:
     options: Mapping[str, Any]
     arguments: Sequence[str]
     sample: str = ""
+    script: str = SCRIPT
 
     @cached_property
     def run_id(self) -> str:
         """Name of the run, by its settings. Variants with equal settings share their runs."""
-        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:8]
+        settings = asdict(self)
+        if self.script == SCRIPT:
+            del settings["script"]  # runs keep the names that they had before experiments could choose a script
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
         last_first = list(self.options.items())[::-1]  # the variant's own options are last, and say most
         setting = "".join(f"-{name}{value}" for name, value in last_first)[:40]
         words = f"{self.scene}-{self.backbone}-{self.method}{setting}-s{self.seed}"
@@ -133,7 +138,8 @@ def _spec(
 ) -> RunSpec:
     chosen = variant.preset.get(name, backbone.preset)
     preset = None if chosen is None else PRESETS[chosen]
-    published = [] if preset is None else preset.arguments(scene.name)
+    iterations = _iterations(experiment, selection, variant)
+    published = [] if preset is None else preset.arguments(scene.name, iterations)
     options = {**backbone.options, **({} if preset is None else preset.options), **variant.options}
     if variant.method != "bare":
         # Stored even when the file does not set it: a changed default must make a new run.
@@ -150,11 +156,12 @@ def _spec(
         rasterizer=backbone.rasterizer,
         checkout=backbone.checkout,
         method=variant.method,
-        iterations=_iterations(experiment, selection, variant),
+        iterations=iterations,
         seed=seed,
         options=options,
         arguments=[] if backbone.checkout is None else [*published, *backbone.arguments, *variant.arguments],
         sample="" if scene.sample is None else scene.sample.label,
+        script=backbone.script,
     )
 
 

@@ -5,104 +5,31 @@ Reads the files that `lapgs bench` writes: results.csv, tables.md and run folder
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from markdown_it import MarkdownIt
 
-from lapgs_bench.experiments.commands import IMPORTED
-from lapgs_bench.experiments.execution import RUNS
-from lapgs_bench.experiments.exports import CSV, MARKDOWN, NAMES, Row, columns_of, read_csv
+from lapgs_bench.experiments.exports import CSV, MARKDOWN, columns_of
+from lapgs_bench.experiments.figures.curves import time_arrows
+from lapgs_bench.experiments.results import Results
 from lapgs_plugin.errors import LapgsError, RunFolderError
-from lapgs_plugin.files import is_folder, write_text
+from lapgs_plugin.files import write_text
 from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer
-from lapgs_plugin.reports.charts import Arrow, Bar, BarChart, Chart, draw_arrows, draw_bars, number_text, seconds_text
+from lapgs_plugin.reports.charts import Bar, BarChart, draw_bars, number_text, seconds_text
 from lapgs_plugin.reports.folders import FolderReport
 from lapgs_plugin.reports.pictures import Strip
 from lapgs_plugin.reports.report import MeasuredRun, render_page, training_charts, view_strips, view_table
-from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import REPORT
 from lapgs_plugin.runs.profiling import PARTS
-from lapgs_plugin.untrusted import read_text, shortened
+from lapgs_plugin.untrusted import read_text
 
 TEMPLATE = Path(__file__).with_name("experiment.html.jinja")
-COLORS = 8
-"""Number of styles of lines and arrows; later variants reuse them."""
-COUNTS = {
-    "weighted_gaussians": "Gaussians of levels, weighted by iterations",
-    "mean_gaussians": "Gaussians optimized, mean",
-    "gaussians": "Gaussians to render",
-}
-"""Columns with numbers of Gaussians; the first that all rows have is drawn."""
-
 PARTS_MS = {f"{part}_ms": part for part in PARTS}
 """Columns with the milliseconds of parts of an iteration."""
-FIGURES = ("train_seconds", "gaussians")
-"""Columns with numbers that every row has."""
-
-
-@dataclass(frozen=True)
-class Results:
-    """Hold the results in an experiment's folder: the rows of its results.csv, in order."""
-
-    folder: Path
-    rows: Sequence[Row]
-
-    @classmethod
-    def read(cls, folder: Path) -> Results:
-        """Read the results in a folder of `lapgs bench`.
-
-        Raises:
-            RunFolderError: they are missing, or cannot be read.
-        """
-        path = folder / CSV
-        try:
-            rows = read_csv(path)
-        except (OSError, ValueError) as error:
-            raise RunFolderError(f"{path} cannot be read ({error}); expected what `lapgs bench` writes") from error
-        for row in rows or [{}]:
-            if missing := {*NAMES, *FIGURES} - row.keys():
-                raise RunFolderError(
-                    f"{path} lacks {', '.join(sorted(missing))}; expected what `lapgs bench` writes when runs are done"
-                )
-            for name, value in row.items():
-                if (name in FIGURES or name in COUNTS or name.endswith(("_seconds", "_ms"))) and isinstance(value, str):
-                    raise RunFolderError(
-                        f"{path}: {shortened(name)} is {shortened(value)}, expected a number; write it again with "
-                        "`lapgs bench` and --tables-only"
-                    )
-        return cls(folder, rows)
-
-    @property
-    def variants(self) -> list[str]:
-        """Variants in the experiment's order."""
-        return list(dict.fromkeys(row["variant"] for row in self.rows))
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Pairs of scene and backbone."""
-        return list(dict.fromkeys((row["scene"], row["backbone"]) for row in self.rows))
-
-    def of(self, scene: str, backbone: str, variant: str) -> list[Row]:
-        """Return the rows of a variant, one for each seed."""
-        wanted = (scene, backbone, variant)
-        return [row for row in self.rows if (row["scene"], row["backbone"], row["variant"]) == wanted]
-
-    def baseline(self, backbone: str) -> str:
-        """Return the variant that others on a backbone are compared with."""
-        return str(next(row["baseline"] for row in self.rows if row["backbone"] == backbone))
-
-    def style(self, variant: str) -> str:
-        """Return the style of a variant's lines and arrows."""
-        return f"variant-{self.variants.index(variant) % COLORS}"
-
-    def title(self, scene: str, backbone: str) -> str:
-        several = len({row["backbone"] for row in self.rows}) > 1
-        return f"{scene}, {backbone}" if several else scene
 
 
 class ExperimentReport(FolderReport):
@@ -124,7 +51,7 @@ class ExperimentReport(FolderReport):
             tables=tables,
             variants={name: results.style(name) for name in results.variants},
             num_runs=len({row["run"] for row in results.rows}),
-            arrows=_time_arrows(results),
+            arrows=time_arrows(results, lambda _, variant: results.style(variant)),
             breakdown=_bars(results, "An iteration", PARTS_MS, lambda value: f"{number_text(value)} ms"),
             overhead=_bars(results, "Overhead", overheads, seconds_text),
             parts=[_part(results, scene, backbone, options) for scene, backbone in results.pairs],
@@ -159,29 +86,6 @@ def _machines(results: Results) -> list[str]:
 # All scenes and backbones together.
 
 
-def _time_arrows(results: Results) -> Chart | None:
-    """Draw time against Gaussians: arrows from every baseline to every other variant, means over the seeds."""
-    column = next(name for name in COUNTS if all(name in row for row in results.rows))
-    arrows = []
-    for scene, backbone in results.pairs:
-        base = results.baseline(backbone)
-        start = _point(results.of(scene, backbone, base), column)
-        for variant in results.variants:
-            end = _point(results.of(scene, backbone, variant), column)
-            if variant != base and start is not None and end is not None:
-                label = f"{results.title(scene, backbone)}: {base} to {variant}"
-                arrows.append(Arrow(results.style(variant), label, start, end))
-    if not arrows:
-        return None
-    return draw_arrows("Optimization (s) against Gaussians", COUNTS[column], arrows)
-
-
-def _point(rows: Sequence[Row], column: str) -> tuple[float, float] | None:
-    if not rows:
-        return None
-    return fmean(row[column] for row in rows), fmean(row["train_seconds"] for row in rows)
-
-
 def _bars(results: Results, title: str, names: Mapping[str, str], text: Callable[[float], str]) -> BarChart | None:
     """Draw a bar for each variant on each backbone that has any of these columns, of means over scenes and seeds."""
     bars = []
@@ -212,7 +116,7 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
     for variant in results.variants:
         for row in results.of(scene, backbone, variant)[:1]:
             try:
-                runs[variant] = _open(results.folder, row)
+                runs[variant] = results.run(row)
             except LapgsError as error:
                 notes.append(f"{variant} is not shown: {error}")
     base = results.baseline(backbone)
@@ -235,10 +139,3 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
         "compared": shown if len(pair) == 1 else f"{shown}, beside {base}",
         "notes": notes,
     }
-
-
-def _open(folder: Path, row: Row) -> MeasuredRun:
-    """Open a run's folder, that of the attempt that finished, inside the experiment's folder, which may be moved."""
-    path = folder / RUNS / Path(str(row.get("folder", row["run"]))).name
-    archive = RunArchive.open(path / IMPORTED if is_folder(path / IMPORTED) else path)
-    return MeasuredRun(archive, archive.metrics() or {"train_seconds": row["train_seconds"]})

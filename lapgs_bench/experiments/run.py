@@ -16,6 +16,7 @@ from lapgs_bench.experiments.checks import check_runs
 from lapgs_bench.experiments.commands import Locations
 from lapgs_bench.experiments.execution import LOGS, STORE, execute, make_samples, prepare
 from lapgs_bench.experiments.expansion import PlannedRun, plan_runs, scenes_of
+from lapgs_bench.experiments.figures.write import FOLDER, write_figures
 from lapgs_bench.experiments.launchers import WorkOrder, check_launcher, launch
 from lapgs_bench.experiments.mistakes import Mistakes
 from lapgs_bench.experiments.schema import Experiment, load_experiment
@@ -35,7 +36,7 @@ from lapgs_plugin.errors import (
     UserInputError,
     printable_lines,
 )
-from lapgs_plugin.files import is_file, write_text
+from lapgs_plugin.files import is_file, is_folder, write_text
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.runs.layout import require_place, require_utf8
 
@@ -148,11 +149,15 @@ def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) 
     text = markdown(table)
     write_text(folder / exports.MARKDOWN, text)
     write_text(folder / exports.LATEX, latex(table))
-    _write_rows(experiment, planned, records, folder)
+    rows = _rows(experiment, planned, records)
+    _write_rows(rows, folder)
+    for problem in write_figures(experiment, rows, folder):
+        make_console(stderr=True).print(f"[yellow]{escape(problem)}[/yellow]")
     console = make_console()
     console.print(Markdown(printable_lines(text))) if console.is_terminal else print(printable_lines(text))
     _name_versions(records)
-    say(f"{folder} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX} and the runs")
+    drawn = f", {FOLDER}/" if is_folder(folder / FOLDER) else ""
+    say(f"{folder} holds {exports.CSV}, {exports.MARKDOWN}, {exports.LATEX}{drawn} and the runs")
     say(f"next: lapgs report {shlex.quote(str(folder))} writes a page with curves and images")
     if failed := [o for o in outcomes.values() if o.state == FAILED]:
         raise RunsFailedError(
@@ -161,15 +166,15 @@ def _write(experiment: Experiment, planned: Sequence[PlannedRun], folder: Path) 
         )
 
 
-def _write_rows(
-    experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, dict[str, Any]], folder: Path
-) -> None:
-    """Write the figures of each run, as CSV and, where pyarrow is installed, as Parquet."""
+def _rows(
+    experiment: Experiment, planned: Sequence[PlannedRun], records: Mapping[str, dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the row of each run that is done."""
     names: dict[str, list[str]] = {}
     for run in planned:
         names.setdefault(run.spec.backbone, []).append(run.variant)
     baselines = {backbone: baseline_of(experiment, own) for backbone, own in names.items()}
-    rows = [
+    return [
         {
             "experiment": experiment.name,
             "variant": run.variant,
@@ -179,6 +184,10 @@ def _write_rows(
         for run in planned
         if run.spec.run_id in records
     ]
+
+
+def _write_rows(rows: Sequence[exports.Row], folder: Path) -> None:
+    """Write the figures of each run, as CSV and, where pyarrow is installed, as Parquet."""
     exports.write_csv(folder / exports.CSV, rows)
     try:
         exports.write_parquet(folder / exports.PARQUET, rows)

@@ -16,9 +16,13 @@ from lapgs_plugin.untrusted import read_toml
 
 T = TypeVar("T")
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+SCRIPT_PATH = r"^(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+\.py$"
+"""A script inside a folder, such as ms/train.py."""
 LINE = r"^[^\x00-\x1f\x7f]*$"
 """Text of one line, which fits into a table."""
-OF_BARE_RUNS = {"gpu_busy"}
+SCRIPT = "train.py"
+"""Training script of most checkouts, in their folder."""
+OF_BARE_RUNS = {"gpu_busy", "test_every"}
 """Options that a checkout's script by itself can be run with."""
 Options = dict[str, bool | int | float | str]
 """Options of `lapgs train` or `lapgs run` by name, without leading dashes and with underscores."""
@@ -106,6 +110,7 @@ class Backbone(_StrictModel):
         title: its name in tables; NAME by default.
         rasterizer: rasterizer of `lapgs train`: gsplat, cpu, auto, ...
         checkout: name of the checkout, whose folder is given by --path or an environment variable.
+        script: training script of the checkout, relative to its folder.
         preset: published options for the scenes of standard data sets, a name in data/presets.toml.
         arguments: arguments of the checkout's script for every run; they override the preset.
         options: options of `lapgs train` for every run, or of `lapgs run` for every hierarchy.
@@ -114,6 +119,7 @@ class Backbone(_StrictModel):
     title: str = Field("", pattern=LINE)
     rasterizer: str | None = None
     checkout: str | None = Field(None, pattern=NAME)
+    script: str = Field(SCRIPT, pattern=SCRIPT_PATH)
     preset: PresetName | None = None
     arguments: list[str] = []
     options: Options = {}
@@ -124,6 +130,8 @@ class Backbone(_StrictModel):
             raise ValueError("give either rasterizer (the built-in trainer) or checkout (a script of its own)")
         if self.rasterizer is not None and (self.preset is not None or self.arguments):
             raise ValueError("preset and arguments are for the script of a checkout")
+        if self.rasterizer is not None and self.script != SCRIPT:
+            raise ValueError("script is for a checkout; leave it out")
         return self
 
     @property
@@ -170,15 +178,39 @@ class Table(_StrictModel):
 
     Attributes:
         paper: the paper's table, a file in data/paper.
+        printed: rows of the paper's table that are shown without a measurement.
         columns: names in `aggregate.COLUMNS`.
         transposed: show each variant as a column.
         by_scene: add a table for each scene.
     """
 
     paper: str | None = None
+    printed: list[str] = []
     columns: list[str] = ["minutes", "psnr", "ssim", "lpips", "gaussians_millions", "fps"]
     transposed: bool = False
     by_scene: bool = False
+
+
+class Figure(_StrictModel):
+    """Check one `[[figures]]` table: an image that is drawn of the results.
+
+    Attributes:
+        kind: what it shows, a name in `figures.KINDS`.
+        scenes: scenes that it shows; empty means all.
+        view: held-out view of `crops`; by default the one whose PSNR is the median.
+    """
+
+    kind: Literal[
+        "psnr_over_seconds", "gaussians_over_iterations", "seconds_over_gaussians", "peak_memory", "crops", "edges"
+    ]
+    scenes: list[str] = []
+    view: str | None = Field(None, pattern=LINE)
+
+    @model_validator(mode="after")
+    def _view_of_crops(self) -> Figure:
+        if self.view is not None and (self.kind != "crops" or len(self.scenes) != 1):
+            raise ValueError("view is for crops of one scene; leave it out")
+        return self
 
 
 class Experiment(_StrictModel):
@@ -192,10 +224,16 @@ class Experiment(_StrictModel):
     backbones: dict[str, Backbone] = Field(min_length=1)
     variants: list[Variant] = Field(min_length=1)
     table: Table = Table()
+    figures: list[Figure] = []
 
     @model_validator(mode="after")
     def _consistent(self) -> Experiment:
-        if problems := [*self._repetitions(), *self._unknown_backbones(), *self._without_effect()]:
+        if problems := [
+            *self._repetitions(),
+            *self._unknown_backbones(),
+            *self._unknown_scenes(),
+            *self._without_effect(),
+        ]:
             raise ValueError("\n".join(problems))
         return self
 
@@ -215,6 +253,13 @@ class Experiment(_StrictModel):
                     f"variants.{number}: variant {variant.name!r} names backbone {name!r}, expected "
                     f"{', '.join(self.backbones)}"
                 )
+
+    def _unknown_scenes(self) -> Iterator[str]:
+        known = {name for entry in self.scenes for name in entry.names}
+        for number, figure in enumerate(self.figures):
+            for name in figure.scenes:
+                if name not in known:
+                    yield f"figures.{number}: scene {name!r} is not in the experiment; {nearest(name, known)}"
 
     def _without_effect(self) -> Iterator[str]:
         """Find settings that change nothing."""
@@ -238,6 +283,7 @@ PARTS: Mapping[str, type[BaseModel]] = {
     "backbones": Backbone,
     "variants": Variant,
     "table": Table,
+    "figures": Figure,
     "sample": SampleScene,
 }
 """The model behind each key that holds tables."""

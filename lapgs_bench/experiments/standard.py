@@ -9,11 +9,13 @@ import csv
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import is_file
+from lapgs_plugin.hierarchy.plan import REFERENCE_ITERATIONS
 from lapgs_plugin.untrusted import read_toml
 
 DATA = Path(__file__).parent / "data"
@@ -43,17 +45,24 @@ class Preset:
     Attributes:
         common: for every scene.
         scenes: further ones by scene.
+        schedule: iterations that the script takes as options, of a run of `REFERENCE_ITERATIONS`; they scale with its
+            length.
         options: those of `lapgs run`, where the script has none.
     """
 
     source: str
     common: tuple[str, ...]
     scenes: Mapping[str, tuple[str, ...]]
+    schedule: Mapping[str, int] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def arguments(self, scene: str) -> list[str]:
-        """Return the script's arguments for a scene; unknown scenes have the common ones."""
-        return [*self.common, *self.scenes.get(scene, ())]
+    def arguments(self, scene: str, iterations: int = REFERENCE_ITERATIONS) -> list[str]:
+        """Return the script's arguments for a scene and a length of the run; unknown scenes have the common ones."""
+        scaled = (
+            (f"--{name}", str(max(1, round(at * iterations / REFERENCE_ITERATIONS))))
+            for name, at in self.schedule.items()
+        )
+        return [*chain.from_iterable(scaled), *self.common, *self.scenes.get(scene, ())]
 
 
 @dataclass(frozen=True)

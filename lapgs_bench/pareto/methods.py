@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_bench.experiments.checks import OWN_ARGUMENTS, sets_option
-from lapgs_bench.experiments.commands import SCRIPT, defaults_of, run_steps
+from lapgs_bench.experiments.commands import defaults_of, run_steps
 from lapgs_bench.experiments.execution import LOGS, RUNS
 from lapgs_bench.experiments.expansion import RunSpec
+from lapgs_bench.experiments.schema import SCRIPT
 from lapgs_bench.experiments.store import Job
 from lapgs_bench.pareto.settings import ParetoSettings
 from lapgs_plugin.checkouts.source import CheckoutSource

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_bench.experiments.exports import write_csv
+from lapgs_bench.experiments.figures.image import draw_charts
 from lapgs_bench.pareto.curves import (
     METRICS,
     Metric,
@@ -20,18 +21,15 @@ from lapgs_bench.pareto.curves import (
 )
 from lapgs_bench.pareto.methods import ONE_FIELD
 from lapgs_plugin.files import write_text
-from lapgs_plugin.reports.charts import Chart, Series, count_text, draw_lines, seconds_text
+from lapgs_plugin.reports.charts import VARIANT_COLORS, Chart, Series, count_text, draw_lines, seconds_text
 from lapgs_plugin.reports.report import render_page
 
 HTML, SVG, CSV = "pareto.html", "pareto.svg", "pareto.csv"
 PAGE_TEMPLATE = Path(__file__).with_name("pareto.html.jinja")
-SVG_TEMPLATE = Path(__file__).with_name("pareto.svg.jinja")
 LPIPS = ("lpips_alex", "lpips_vgg", "lpips_squeeze")
 """Columns of an evaluation that can be the LPIPS of a page: the first that all of its runs have."""
 LATE = 0.1
 """Share by which a run may exceed a budget and still count for it."""
-STYLES = 8
-"""Number of styles of lines; later methods reuse them."""
 FRONT = "front"
 
 Row = Mapping[str, Any]
@@ -96,7 +94,7 @@ class Curves:
     def styles(self) -> dict[str, str]:
         """Styles of lines by method."""
         methods = dict.fromkeys(row["method"] for row in self.rows)
-        return {method: f"variant-{number % STYLES}" for number, method in enumerate(methods)}
+        return {method: f"variant-{number % len(VARIANT_COLORS)}" for number, method in enumerate(methods)}
 
     @property
     def metrics(self) -> list[Metric]:
@@ -149,19 +147,6 @@ class Curves:
 
 def _places(points: Sequence[Point], metric: Metric) -> list[tuple[float, float]]:
     return sorted((point.seconds, point.values[metric.key]) for point in points)
-
-
-def draw_charts(charts: Sequence[Chart], styles: Mapping[str, str], label: str, title: str, columns: int) -> str:
-    """Return an SVG image of charts, row by row.
-
-    Args:
-        charts: of one size.
-        styles: of lines, by what they stand for.
-        label: says what the image shows.
-        title: written above.
-        columns: charts beside each other.
-    """
-    return render_page(SVG_TEMPLATE, charts=charts, styles=styles, label=label, title=title, columns=columns)
 
 
 def write_results(curves: Curves, folder: Path) -> None:

@@ -31,6 +31,7 @@ class Adapter(BackboneAdapter):
         name="dashgaussian",
         title="DashGaussian",
         rasterizer="diff_gaussian_rasterization",
+        stand_in="graphdeco-accel",  # its submodule, which its published runs need for --optimizer_type sparse_adam
         own_files=("train_dash.py", "utils/schedule_utils.py"),
         family_files=(),
         fork_of=("graphdeco",),

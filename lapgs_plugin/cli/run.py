@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from lapgs_plugin.checkouts.splat_script import SplatScript
     from lapgs_plugin.runs.watcher import Watcher
 
-OF_OFF = {"off", "script", "arguments", "record", "gpu_busy", "backbone", "device", "rasterizer", "verbose", "seed"}
+OF_OFF = {
+    *("off", "script", "arguments", "record", "gpu_busy", "test_every"),
+    *("backbone", "device", "rasterizer", "verbose", "seed"),
+}
 """Parameters that `--off` can be combined with."""
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -111,8 +114,9 @@ def run(
         options_given = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
         raise UserInputError(f"{options_given} has no effect with --off, which runs the script unchanged; leave it out")
     plain = options.off and not options.record
-    if measuring.gpu_busy and plain:
-        raise UserInputError("--gpu-busy has no effect with --off, which runs the script unchanged; add --record")
+    measured = {"--gpu-busy": measuring.gpu_busy, "--test-every": measuring.test_every is not None}
+    if plain and (idle := [name for name, chosen in measured.items() if chosen]):
+        raise UserInputError(f"{idle[0]} has no effect with --off, which runs the script unchanged; add --record")
     # What is refused by the sources alone is refused before PyTorch is imported.
     path, words = require_script(script), arguments or []
     splats = SplatScript.read(path) if options.backbone is None else None
@@ -223,7 +227,7 @@ def _execute(
                 return
             if options.off:
                 reasons = None if compiled is None else compiled.reasons
-                BareRunRecorder(kind(loaded), device, measuring.gpu_busy, reasons).run()
+                BareRunRecorder(kind(loaded), device, measuring, reasons).run()
                 return
             request = RunRequest(
                 kind(loaded),

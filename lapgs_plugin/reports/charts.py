@@ -6,6 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+VARIANT_COLORS = ("#c2571a", "#1767c2", "#2c8a4a", "#8a4fa3", "#a8324f", "#7a6a1f", "#2c8a86", "#5c6670")
+"""Colours of the styles variant-0, variant-1, ... of lines and arrows."""
+PART_COLORS = (
+    *("#2f6fb0", "#2c8a86", "#8a4fa3", "#b3622a", "#a33d55", "#4d7f2c", "#7a6a1f", "#6b747d", "#4a4f9c", "#8a5a44"),
+)
+"""Colours of the parts of bars."""
 CHARACTER_WIDTH = 7.5
 """Approximate width of a character of a label in chart units."""
 LINE_HEIGHT = 14.0

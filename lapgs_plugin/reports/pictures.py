@@ -98,7 +98,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class _Layer:
+class Layer:
     """Content of a picture: (3, h, w) at full resolution."""
 
     caption: str
@@ -116,31 +116,31 @@ def make_strip(view: View, why: str, figures: str, renderers: Sequence[Hierarchy
         renderers: of the run, then of its baseline.
     """
     layers = _layers(view, renderers)
-    cutouts = tuple(_cut_out(layers, square) for square in edge_squares(view.image, CUTOUTS))
-    return Strip(view.name, why, figures, tuple(_shrink(layer) for layer in layers), cutouts)
+    cutouts = tuple(cut_out(layers, square) for square in edge_squares(view.image, CUTOUTS))
+    return Strip(view.name, why, figures, tuple(shrink(layer) for layer in layers), cutouts)
 
 
-def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[_Layer]:
+def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[Layer]:
     """Render the layers of a view, upsampled to full resolution."""
     renderer = renderers[0]
     composition = renderer.render(view.camera)
-    layers = [_Layer("Photo", "ground truth", view.image)]
+    layers = [Layer("Photo", "ground truth", view.image)]
 
     def whole(image: Tensor, level: int) -> Tensor:
         return to_full_size(image, view.camera.size, level, renderer.pyramid).cpu()
 
     coarsest = renderer.levels - 1
     if composition.residuals:
-        layers.append(_Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
+        layers.append(Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
     for level, residual in composition.residuals.items():
         detail = f"{_level_label(level, residual)}, zero is grey"
         layers.append(
-            _Layer("Difference" if renderer.nested else "Residual", detail, around_grey(whole(residual, level)))
+            Layer("Difference" if renderer.nested else "Residual", detail, around_grey(whole(residual, level)))
         )
-    layers.append(_Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
+    layers.append(Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
     for baseline in renderers[1:]:
         image = baseline.render(view.camera).composed[0].cpu()
-        layers.append(_Layer("Baseline", "rendered by the baseline", image))
+        layers.append(Layer("Baseline", "rendered by the baseline", image))
     return layers
 
 
@@ -172,7 +172,7 @@ def edge_squares(photo: Tensor, count: int) -> list[tuple[int, int, int]]:
     return squares
 
 
-def _cut_out(layers: Sequence[_Layer], square: tuple[int, int, int]) -> Cutout:
+def cut_out(layers: Sequence[Layer], square: tuple[int, int, int]) -> Cutout:
     left, top, side = square
     height, width = layers[0].image.shape[-2:]
     pictures = []
@@ -184,7 +184,7 @@ def _cut_out(layers: Sequence[_Layer], square: tuple[int, int, int]) -> Cutout:
     )
 
 
-def _shrink(layer: _Layer) -> Picture:
+def shrink(layer: Layer) -> Picture:
     height, width = layer.image.shape[-2:]
     scale = min(1.0, IMAGE_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))

@@ -20,6 +20,8 @@ from lapgs_plugin.rendering.options import RenderOptions
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.reports.charts import (
     INSET_AT,
+    PART_COLORS,
+    VARIANT_COLORS,
     Arrow,
     Bar,
     BarChart,
@@ -133,10 +135,13 @@ def render_page(template: Path, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template.name).render(values, inset_at=INSET_AT)
+    return environment.get_template(template.name).render(
+        values, inset_at=INSET_AT, variant_colors=VARIANT_COLORS, part_colors=PART_COLORS
+    )
 
 
 History = list[dict[str, Any]]
+"""Entries of a run, each with its time and its iterations since the run's start."""
 
 
 def training_charts(
@@ -151,7 +156,7 @@ def training_charts(
     """
     longest = max(run.metrics["train_seconds"] for run in runs)
     unit, scale = ("minutes", 60.0) if longest >= MINUTES_FROM else ("seconds", 1.0)
-    histories = [_history(run, scale) for run in runs]
+    histories = [run_history(run, scale) for run in runs]
     lines = list(zip(kinds, histories, strict=True))[::-1]  # draws the first on top
     return {
         x: _chart_row(lines, x, label, start, _stage_marks(histories[0], x) if marked else [])
@@ -163,7 +168,7 @@ def training_charts(
     }
 
 
-def _history(run: MeasuredRun, scale: float) -> History:
+def run_history(run: MeasuredRun, scale: float) -> History:
     """Return a run's history with "time", in units of `scale` seconds, and "iterations" since the run's start.
 
     Entries from after a stage have the time of its end. The file counts iterations within a stage.

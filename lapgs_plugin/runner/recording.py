@@ -31,6 +31,7 @@ from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.step_clock import TimedLoop, counting_steps, timing_replacements
 from lapgs_plugin.runs.layout import exists
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.stages.record import LoopRecord
 
 logger = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ class BareRunRecorder(TimedLoop):
     Args:
         adapter: adapter of the script's backbone.
         device: "cuda", or "cpu" inside `cpu_device.cuda_on_cpu`.
-        gpu_busy: profile some iterations; needs a CUDA device.
+        measuring: what is measured in training; `gpu_busy` needs a CUDA device, and `breakdown` has no effect.
         compiled: why modules of ours are in the places of its compiled ones, by package.
     """
 
@@ -53,11 +54,11 @@ class BareRunRecorder(TimedLoop):
         self,
         adapter: BackboneAdapter,
         device: str,
-        gpu_busy: bool = False,
+        measuring: MeasuringOptions = MeasuringOptions(),
         compiled: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(LoopRecord(torch.device(device)))
-        self._adapter, self._device, self._gpu_busy = adapter, torch.device(device), gpu_busy
+        self._adapter, self._device, self._measuring = adapter, torch.device(device), measuring
         self._compiled = dict(compiled or {})
         self._call: TrainingCall | None = None
         self._scene: Any = None
@@ -98,7 +99,7 @@ class BareRunRecorder(TimedLoop):
             folder = self._call.dataset.model_path  # empty: the script makes one
             if folder and exists(Path(folder) / MANIFEST):
                 raise RunFolderError(f"-m {folder}: it holds a run in levels; give a bare run another folder")
-            self.record = LoopRecord(self._device, self._call.opt.iterations if self._gpu_busy else 0)
+            self.record = LoopRecord(self._device, self._call.opt.iterations if self._measuring.gpu_busy else 0)
             self._timeline = []
             result = original(*args, **kwargs)
             if self.iteration:
@@ -130,8 +131,14 @@ class BareRunRecorder(TimedLoop):
         if self.iteration == 0:
             record.start()
         record.start_clock()
-        record.count(self.iteration + 1, count)
         assert self._call is not None, "training() makes iterations"
+        every, done = self._measuring.test_every, self.iteration
+        if every is not None and done and done % every == 0:
+            entry = {"iteration": done, "elapsed": record.elapsed(), "num_gaussians": count}
+            with record.outside("evaluation"):
+                quality = self._held_out(self._call)
+            self._timeline.append({**entry, **quality})
+        record.count(done + 1, count)
         if self.iteration % max(1, self._call.opt.iterations // TIMELINE_ENTRIES) == 0:
             entry = {"iteration": self.iteration, "elapsed": record.elapsed(), "num_gaussians": count}
             self._timeline.append(entry)
@@ -139,6 +146,10 @@ class BareRunRecorder(TimedLoop):
     def _contents(self, call: TrainingCall) -> dict[str, Any]:
         """Return the contents of the file, which `imported` and `experiments.rows` read."""
         record, counts, count = self.record, self.record.counts, len(self.gaussians._xyz)
+        quality = self._held_out(call)
+        if self._measuring.test_every is not None:
+            at_end = {"iteration": self.iteration, "elapsed": counts.seconds, "num_gaussians": count}
+            self._timeline.append({**at_end, **quality})
         return {
             "backbone": self._adapter.info.name,
             **({"compiled": self._compiled} if self._compiled else {}),
@@ -150,7 +161,7 @@ class BareRunRecorder(TimedLoop):
             "mean_gaussians": counts.mean_gaussians,
             "memory_bytes": record.memory_bytes,
             **({} if (busy := record.busy.seconds()) is None else {"gpu_busy_seconds": busy}),
-            **self._held_out(call),
+            **quality,
             "timeline": self._timeline,
         }
 

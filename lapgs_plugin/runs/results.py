@@ -100,6 +100,8 @@ class Timeline(Strict):
     iteration: NonNegativeInt
     elapsed: NonNegativeFloat
     num_gaussians: NonNegativeInt
+    psnr: NotRequired[float]
+    ssim: NotRequired[float]
 
 
 class BareRecord(Strict):

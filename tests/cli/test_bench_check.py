@@ -264,6 +264,14 @@ def test_gpus_of_other_machines_are_not_required_here(monkeypatch: pytest.Monkey
     assert commands_of(text).count("\n# ") + 1 == 10, "two seeds of five runs"
 
 
+STUB_OF = {
+    **{name: name for name in ("fastgs", "taming", "graphdeco")},
+    **{"original": "graphdeco", "dashgaussian": "dash", "efficientgs": "efficient"},
+    **{"mini_splatting": "mini", "speedy_splat": "speedy"},
+}
+"""Stubs by the checkouts of shipped experiments."""
+
+
 def test_shipped_experiments_have_nothing_that_is_refused(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check each with one scene instead of its data sets, large enough for its levels."""
     scene = scenes / "scene"
@@ -278,7 +286,7 @@ def test_shipped_experiments_have_nothing_that_is_refused(scenes: Path, monkeypa
             if not link.exists():
                 link.symlink_to(scene)
         paths = [f"{name}={scenes / 'links' / name}" for name in names]
-        paths += [f"{name}={CHECKOUTS / name}" for name in ("fastgs", "taming", "graphdeco")]
+        paths += [f"{name}={CHECKOUTS / folder}" for name, folder in STUB_OF.items()]
         words = ["bench", shipped, "--dry-run", "--no-eval", *(word for p in paths for word in ("--path", p))]
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, (shipped, str(result.exception))

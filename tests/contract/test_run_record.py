@@ -21,6 +21,7 @@ from lapgs_plugin.files import BARE_RECORD
 from lapgs_plugin.runner.imported import import_run, read_foreign_run
 from lapgs_plugin.runner.recording import BareRunRecorder
 from lapgs_plugin.runs import gpu_busy
+from lapgs_plugin.runs.options import MeasuringOptions
 from tests.contract.stub_runs import (
     CHECKOUTS,
     ITERATIONS,
@@ -37,6 +38,8 @@ from tests.contract.stub_runs import (
     without,
 )
 
+EVERY = ITERATIONS // 3
+"""Iterations between two measurements of held-out views."""
 PROFILED = 0.5
 """Seconds of kernels that the stand-in of a GPU's profile finds each time."""
 
@@ -46,10 +49,11 @@ def _profile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_busy, "profile_kernels", lambda: lambda: PROFILED)
 
 
-def record(name: str, scene: Path, folder: Path) -> Result:
+def record(name: str, scene: Path, folder: Path, test_every: int | None = None) -> Result:
     results: list[Result] = []
+    measuring = MeasuringOptions(gpu_busy=True, test_every=test_every)
     with captured(folder, results), loaded(STUBS[name], scene, folder, *SAVING) as adapter:
-        BareRunRecorder(adapter, "cpu", gpu_busy=True).run()
+        BareRunRecorder(adapter, "cpu", measuring).run()
     return results[0]
 
 
@@ -78,6 +82,32 @@ def test_a_recorded_run_is_the_bare_run_to_the_bit(
     assert values["gpu_busy_seconds"] == pytest.approx(profiled_iterations * ITERATIONS)
     assert values["train_seconds"] + values["saving_seconds"] < wall
     assert values["timeline"][-1]["elapsed"] <= values["train_seconds"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_held_out_quality_along_a_run_changes_nothing(
+    name: str, bare_run: Callable[[str], tuple[Result, Tensor]], scene: Path, tmp_path: Path
+) -> None:
+    bare, _ = bare_run(name)
+    recorded = record(name, scene, tmp_path / "recorded", test_every=EVERY)
+    assert recorded.losses == bare.losses
+    assert files(recorded.folder) == files(bare.folder)
+
+    values = json.loads((recorded.folder / BARE_RECORD).read_text())
+    measured = [entry for entry in values["timeline"] if "psnr" in entry]
+    assert [entry["iteration"] for entry in measured] == [*range(EVERY, ITERATIONS, EVERY), ITERATIONS]
+    assert measured[-1]["psnr"] == values["psnr"]
+    assert measured[-1]["elapsed"] == values["train_seconds"]
+    times = [entry["elapsed"] for entry in values["timeline"]]
+    assert times == sorted(times)
+
+
+def test_quality_along_a_bare_run_is_in_the_history_of_the_imported_run(scene: Path, tmp_path: Path) -> None:
+    recorded = record("graphdeco", scene, tmp_path / "recorded", test_every=EVERY)
+    values = json.loads((recorded.folder / BARE_RECORD).read_text())
+    archive = import_run(read_foreign_run(recorded.folder), tmp_path / "imported", codebase="graphdeco")
+    psnrs = [entry["psnr"] for entry in archive.history() if "psnr" in entry]
+    assert psnrs == [entry["psnr"] for entry in values["timeline"] if "psnr" in entry]
 
 
 def test_iterations_are_steps_where_nothing_says_when_they_begin(scene: Path, tmp_path: Path) -> None:
@@ -116,7 +146,7 @@ def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) ->
     ("given", "named"),
     [
         (("--breakdown",), "--breakdown"),
-        (("--record", "--test-every", 5), "--test-every"),
+        (("--test-every", 5), "--test-every"),
         (("--resume", "--prune", 0.0, "--levels", 2), "--levels, --prune, --resume"),
         (("--no-fused-adam",), "--fused-adam"),
         (("--gpu-busy",), "--gpu-busy"),

@@ -270,4 +270,4 @@ def test_folders_of_scenes_and_checkouts(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(UserInputError, match="nowhere is not a folder"):
         Locations({"garden": tmp_path / "nowhere"}, tmp_path).scene(garden)
     with pytest.raises(UserInputError, match=r"has no train\.py"):
-        Locations({"fastgs": tmp_path}, tmp_path).checkout("fastgs")
+        Locations({"fastgs": tmp_path}, tmp_path).checkout("fastgs", "train.py")

@@ -132,6 +132,10 @@ def test_the_shipped_experiments(path: Path) -> None:
         assert set(kinds.values()) == {"nested", "laplacian"}
         return
     assert [name for name, kind in kinds.items() if kind != "laplacian" and name not in ("nested", "one level")] == []
+    if path.stem == "convergence":
+        assert {figure.kind for figure in experiment.figures} == {"psnr_over_seconds", "gaussians_over_iterations"}
+        assert all(run.spec.options["test_every"] == 1000 for run in planned), "bare runs, too"
+        return
     assert paper is not None
     with_figures = [variant for variant in experiment.variants if variant.paper_row("fastgs")]
     assert len(with_figures) >= 2, "most rows stand beside the paper's"
@@ -139,4 +143,4 @@ def test_the_shipped_experiments(path: Path) -> None:
 
 def test_there_is_an_experiment_for_every_table() -> None:
     wanted = {"main_1k", "main_2k", "main_4k", "split", "levels", "loss", "inheritance", "inheritance_ratio", "peak"}
-    assert EXPERIMENTS.keys() == wanted | {"breakdown", "hierarchy", "smoke"}
+    assert EXPERIMENTS.keys() == wanted | {"breakdown", "convergence", "hierarchy", "smoke"}

@@ -33,5 +33,7 @@ def test_the_smoke_experiment_runs_from_end_to_end(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["variant"] for row in rows] == variants
     assert all(float(row["psnr"]) > 14 for row in rows)  # seen 14.69 and 14.74
+    pictures = {"crops-sample", "edges-sample", "psnr_over_seconds-sample", "gaussians_over_iterations-sample"}
+    assert {path.stem for path in (out / "figures").glob("*.svg")} == pictures | {"seconds_over_gaussians"}
     tables = (out / "tables.md").read_text()
     assert all(f"| {variant} |" in tables for variant in variants)

@@ -1,0 +1,1 @@
+"""Draw figures of an experiment's results, as SVG and PNG."""
