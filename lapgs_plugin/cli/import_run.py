@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lapgs_plugin.adapters.registry import OWN
+from lapgs_plugin.adapters.registry import GENERIC, OWN
 from lapgs_plugin.cli.output import say
 from lapgs_plugin.errors import UserInputError
 
@@ -22,7 +22,10 @@ def import_run(
         Path | None, typer.Option("--scene", "-s", help="Scene folder, if it was moved after training.")
     ] = None,
     backbone: Annotated[
-        str | None, typer.Option(help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}.")
+        str | None,
+        typer.Option(
+            help=f"Codebase that trained it, if the folder does not tell: {', '.join(OWN)}, or {GENERIC} (any fork)."
+        ),
     ] = None,
     iteration: Annotated[
         int | None, typer.Option(help="Import the model saved at this iteration. Default: the last one.")

@@ -26,8 +26,9 @@ from typing import Any, Literal
 from typing_extensions import NotRequired
 
 from lapgs_plugin.adapters.base import BackboneAdapter
+from lapgs_plugin.adapters.generic import Adapter as GenericAdapter
 from lapgs_plugin.adapters.info import RASTER_OPTIONS, BackboneInfo
-from lapgs_plugin.adapters.registry import BACKBONES, all_adapters
+from lapgs_plugin.adapters.registry import BACKBONES, GENERIC, all_adapters
 from lapgs_plugin.errors import RunFolderError, UserInputError, errors_about
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import BARE_RECORD
@@ -218,11 +219,11 @@ def import_run(
         RunFolderError: the scene is missing, a field is damaged, or `out` cannot be written.
         SceneError: the scene cannot be read.
     """
-    known, name = list(BACKBONES), codebase or run.codebase
+    known, name = [*BACKBONES, GENERIC], codebase or run.codebase
     if name is None or name not in known:
         untold = f"--backbone (not given): {run.folder} does not say which backbone trained it"
         raise UserInputError(f"{untold if name is None else f'--backbone {name}'}, expected one of {', '.join(known)}")
-    backbone = BACKBONES[name]
+    backbone = GenericAdapter if name == GENERIC else BACKBONES[name]
     require_room(out, overwrite)
     recorded = {name: value for name, value in run.options.items() if _is_raster_option(name, value)}
     settings = {**backbone.info.raster_defaults, **recorded, **_checked(settings or {})}
@@ -301,7 +302,7 @@ def _recognised(options: Mapping[str, Any], record: Mapping[str, Any], breakdown
     infos = [adapter.info for adapter in all_adapters()]
     by_options = [info for info in infos if any(name in options for name in info.telling_options)]
     told = (record.get("backbone"), *(info.name for info in by_options), breakdown.get("backbone"))
-    return next((name for name in told if name in list(BACKBONES)), None)
+    return next((name for name in told if name in [*BACKBONES, GENERIC]), None)
 
 
 def _is_raster_option(name: str, value: object) -> bool:

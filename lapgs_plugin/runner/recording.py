@@ -54,7 +54,7 @@ class BareRunRecorder(TimedLoop):
         self,
         adapter: BackboneAdapter,
         device: str,
-        measuring: MeasuringOptions = MeasuringOptions(),
+        measuring: MeasuringOptions,
         compiled: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(LoopRecord(torch.device(device)))

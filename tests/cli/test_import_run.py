@@ -222,6 +222,9 @@ def test_what_the_folder_tells_of_its_codebase(foreign: Foreign) -> None:
     (foreign.folder / BARE_RECORD).write_text(json.dumps(noted))
     lapgs("import-run", foreign.folder, "--overwrite")
     assert RunArchive.open(foreign.folder / "lapgs").manifest.settings["backbone"]["name"] == "fastgs"
+    (foreign.folder / BARE_RECORD).write_text(json.dumps({**noted, "backbone": "generic"}))
+    lapgs("import-run", foreign.folder, "--overwrite")  # as `lapgs bench` does with a fork that has no adapter
+    assert RunArchive.open(foreign.folder / "lapgs").manifest.settings["backbone"]["name"] == "generic"
 
 
 @pytest.mark.parametrize(

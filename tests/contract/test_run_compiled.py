@@ -31,6 +31,7 @@ from lapgs_plugin.runner.rasterizer_choice import CHOICE
 from lapgs_plugin.runner.recording import BareRunRecorder
 from lapgs_plugin.runner.settings import RunSettings
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.runs.results import read_bare_record
 from tests.contract.stub_runs import STUBS, StopAt, Stub, arguments, edited_graphdeco, forgetting_stubs
 
@@ -303,7 +304,9 @@ def test_a_bare_run_without_compiled_modules_says_so_in_its_record(scene: Path, 
     compiled, folder = modules_of(stub.script, bare=True), tmp_path / "run"
     words = arguments(stub, scene, folder, SHORT)
     with forgetting_stubs(), cuda_on_cpu(None), compiled.in_place(), loaded_script(stub.script, words) as script:
-        BareRunRecorder(adapter_class(stub.script.parent)(script), "cpu", compiled=compiled.reasons).run()
+        BareRunRecorder(
+            adapter_class(stub.script.parent)(script), "cpu", MeasuringOptions(), compiled=compiled.reasons
+        ).run()
     assert read_bare_record(folder / BARE_RECORD)["compiled"] == compiled.reasons
 
 

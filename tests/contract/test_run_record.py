@@ -118,7 +118,7 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(scene: Path, tm
     folder, more = tmp_path / "out", ("--iterations", 20)
     with captured(folder, []), loaded(STUBS["graphdeco"], scene, folder, *more, script=script) as adapter:
         without(adapter.profile.model, "update_learning_rate")
-        BareRunRecorder(adapter, "cpu").run()
+        BareRunRecorder(adapter, "cpu", MeasuringOptions()).run()
     values = json.loads((folder / BARE_RECORD).read_text())
     assert values["iterations"] == 20, "the loop leaves out the last step"
     assert [entry["iteration"] for entry in values["timeline"]] == list(range(1, 21))

@@ -206,6 +206,47 @@ def test_commands_of_a_checkout(tmp_path: Path) -> None:
     assert words_after(importing.command, "--set", "--out") == ["mult=0.7", str(tmp_path / "r" / "lapgs")]
 
 
+def test_checkouts_have_scripts_in_folders(tmp_path: Path) -> None:
+    (tmp_path / "ms").mkdir()
+    (tmp_path / "ms" / "train.py").write_text("")
+    built = experiment(
+        backbones={"mini": {"checkout": "mini", "script": "ms/train.py"}, "gs": {"checkout": "mini"}},
+        variants=[{"name": "bare", "method": "bare"}],
+        scenes=[{"name": "a", "path": "a", "resolution": "1/2"}],
+    )
+    mini, plain = (run.spec for run in plan_runs(built, Selection(seeds="0")))
+    assert mini.run_id != plain.run_id
+    places = Locations({"mini": tmp_path}, tmp_path)
+    assert places.checkout("mini", mini.script) == tmp_path
+    step = run_steps(mini, tmp_path, tmp_path, tmp_path / "r", None)[0]
+    assert str(tmp_path / "ms/train.py") in step.command
+    assert step.cwd == str(tmp_path)
+    with pytest.raises(UserInputError, match=r"has no train\.py"):
+        places.checkout("mini", plain.script)
+
+
+def test_published_schedules_scale_with_the_length_of_a_run() -> None:
+    built = experiment(
+        backbones={"dash": {"checkout": "dash", "script": "train_dash.py", "preset": "dashgaussian.fast"}},
+        variants=[{"name": "bare", "method": "bare"}, {"name": "short", "iterations": 10_000}],
+        iterations=30_000,
+    )
+    spec, short = (run.spec for run in plan_runs(built, Selection(seeds="0", scenes=["a"])))
+    assert words_after(tuple(spec.arguments), "--densify_until_iter") == ["27000"]
+    assert words_after(tuple(short.arguments), "--densify_until_iter") == ["9000"]
+
+
+def test_bare_runs_measure_held_out_views_along_the_way(tmp_path: Path) -> None:
+    options = {"test_every": 1000, "prune": 0.01}
+    built = experiment(
+        backbones={"fast": {"checkout": "fastgs", "options": options}}, variants=[{"name": "bare", "method": "bare"}]
+    )
+    spec = plan_runs(built, Selection(seeds="0", scenes=["a"]))[0].spec
+    assert spec.options == {"test_every": 1000}, "a script by itself prunes nothing"
+    training = bare_steps(tmp_path, [], options=spec.options)[0]
+    assert training.command[3:10] == ("run", "--off", "--record", "--seed", "0", "--test-every", "1000")
+
+
 def bare_steps(folder: Path, arguments: list[str], **changes: Any) -> list[Step]:
     """Return the steps of a checkout's script by itself, evaluated."""
     spec = {"method": "bare", "resolution": "1/2", "iterations": 30_000, "options": {}, **changes}

@@ -57,6 +57,8 @@ def test_defaults_are_those_of_the_paper(tmp_path: Path) -> None:
         ('title = "X"', 'title = "X"\niterations = "many"', ("iterations", "'many'", "integer")),
         ('title = "X"', 'title = "X"\niterations = 0', ("iterations", "greater than or equal to 1")),
         ('title = "X"', 'title = "X"\nseeds = []', ("seeds",)),
+        ('checkout = "fastgs"', 'checkout = "fastgs"\nscript = "../train.py"', ("backbones.fast.script", "pattern")),
+        ('rasterizer = "cpu"', 'rasterizer = "cpu"\nscript = "ms/train.py"', ("script is for a checkout",)),
         ('title = "X"', "", ("title is missing",)),
         ('path = "a"', 'path = "a"\ndataset = "mipnerf360"', ("either dataset or name",)),
         ('name = "a"\npath = "a"', 'dataset = "mipnerf"', ("'mipnerf' is not known", "mipnerf360")),
@@ -144,3 +146,28 @@ def test_the_shipped_experiments(path: Path) -> None:
 def test_there_is_an_experiment_for_every_table() -> None:
     wanted = {"main_1k", "main_2k", "main_4k", "split", "levels", "loss", "inheritance", "inheritance_ratio", "peak"}
     assert EXPERIMENTS.keys() == wanted | {"breakdown", "convergence", "hierarchy", "smoke"}
+
+
+@pytest.mark.parametrize(
+    ("figure", "words"),
+    [
+        ('kind = "pie"', ("figures.0.kind", "'psnr_over_seconds'")),
+        ('kind = "crops"\nscenes = ["b"]', ("figures.0", "scene 'b' is not in the experiment")),
+        ('kind = "crops"\nview = "0.jpg"', ("figures.0", "view is for crops of one scene")),
+        ('kind = "edges"\nscenes = ["a"]\nview = "0.jpg"', ("figures.0", "view is for crops of one scene")),
+        ('kind = "crops"\nscene = ["a"]', ("unknown key figures.0.scene", "did you mean scenes?")),
+    ],
+)
+def test_mistakes_in_figures(figure: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with pytest.raises(UserInputError) as caught:
+        load(tmp_path, f"{GOOD}[[figures]]\n{figure}\n")
+    assert "\n" not in str(caught.value)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_mistakes_in_printed_rows(tmp_path: Path) -> None:
+    printed = 'printed = ["Opti3DG"]\n'
+    with pytest.raises(UserInputError, match=r"there is no table\.paper whose rows these are"):
+        check_table(load(tmp_path, f"{GOOD}[table]\n{printed}"))
+    with pytest.raises(UserInputError, match=r"table.printed: .* main_1k has no row 'Opti3DG'; did you mean Opti3DGS"):
+        check_table(load(tmp_path, f'{GOOD}[table]\npaper = "main_1k"\n{printed}'))

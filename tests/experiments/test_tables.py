@@ -120,6 +120,16 @@ def test_the_papers_means_over_a_data_set_are_noted() -> None:
     assert "[3.96]" in markdown(table_of(experiment))
 
 
+def test_rows_that_are_only_printed() -> None:
+    shape = {"paper": "main_1k", "printed": ["Opti3DGS"], "columns": ["minutes", "psnr"]}
+    table = table_of(paper_experiment(table=shape))
+    assert markdown(table).count("| Opti3DGS (printed only) | - [15.99] | - [30.53] | - | - |") == 1  # of both scenes
+    assert "Opti3DGS (printed only) & -" in latex(table)
+    sections = [{"name": "bare", "method": "bare", "section": "Bare"}, {"name": "two", "section": "Levels"}]
+    text = markdown(table_of(paper_experiment(table=shape, variants=sections)))
+    assert text.index("**Levels**") < text.index("**As printed**") < text.index("Opti3DGS")
+
+
 def test_markdown() -> None:
     lines = markdown(table_of(paper_experiment())).splitlines()
     assert lines[0] == "# Main_comparison"

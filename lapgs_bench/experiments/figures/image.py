@@ -134,21 +134,18 @@ def write_image(path: Path, svg: str) -> None:
     with one_line_errors(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path.with_suffix(".svg"), svg)
-    png = png_of(svg, path.with_suffix(".png").name)
+    png = png_of(svg)
     with one_line_errors(path), atomic_write(path.with_suffix(".png")) as stream:
         stream.write(png)
 
 
-def png_of(svg: str, subject: str) -> bytes:
+def png_of(svg: str) -> bytes:
     """Return an SVG image as the bytes of a PNG file.
-
-    Args:
-        svg: the image.
-        subject: what needs it, for the error.
 
     Raises:
         MissingExtraError: resvg_py is not installed, or this machine has no font for the image's text.
     """
+    subject = "a figure as PNG"
     require_extra("resvg_py", "figures", subject)
     import resvg_py
 

@@ -32,9 +32,14 @@ def write_figures(experiment: Experiment, rows: Sequence[Row], folder: Path) -> 
     for figure in experiment.figures if rows else ():
         for name, draw in _images(experiment, figure, results):
             try:
-                write_image(folder / FOLDER / name, draw())
+                image = draw()
             except LapgsError as error:
-                problems[f"{figure.kind} is left out or incomplete: {error}"] = None
+                problems[f"{name} is left out: {error}"] = None
+                continue
+            try:
+                write_image(folder / FOLDER / name, image)
+            except LapgsError as error:
+                problems[str(error)] = None
     return list(problems)
 
 
