@@ -126,14 +126,21 @@ def draw_time_against_gaussians(experiment: Experiment, results: Results, scenes
     Raises:
         NothingToDrawError: there is no pair of a baseline and another variant.
     """
-    methods = Methods.of(experiment, results)
     chosen = Results(results.folder, [row for row in results.rows if row["scene"] in scenes])
+    compared = {backbone for _, backbone in chosen.pairs}
+    labels = Methods.of(experiment, results).labels
+    # Colours are of arrows alone: with those of baselines, too, many backbones would share them.
+    methods = Methods(
+        {
+            (backbone, variant): label
+            for (backbone, variant), label in labels.items()
+            if backbone in compared and variant != chosen.baseline(backbone)
+        }
+    )
     chart = time_arrows(chosen, methods.style) if chosen.rows else None
     if chart is None:
         raise NothingToDrawError("no scene has a baseline and another variant of one backbone; run both")
-    compared = {backbone for _, backbone in chosen.pairs}
-    drawn = [pair for pair in methods.labels if pair[0] in compared and pair[1] != chosen.baseline(pair[0])]
-    legend = methods.legend(drawn)
+    legend = methods.legend(list(methods.labels))
     return draw_charts([chart], legend, "Seconds over Gaussians", "Arrows from the baseline to", columns=1)
 
 
