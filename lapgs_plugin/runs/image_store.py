@@ -45,8 +45,10 @@ EIGHT_BIT_TOLERANCE = 1e-6
 """Largest distance from k/255 of a value of an 8-bit image: a GPU multiplies by 1/255, which may be an ulp off."""
 AHEAD = 8
 """Most prefetched images that wait on the device; one more replaces the oldest, which may never be used."""
-LOADERS = 2
-"""Threads that read files: one can read while the other's image is being copied."""
+AHEAD_BYTES = 2 << 30
+"""Most bytes of them, of which one may have more."""
+LOADERS = 4
+"""Threads that read files. Some read while the image of another is being copied."""
 
 
 def choose_place(total_bytes: int, device: torch.device | str) -> str:
@@ -160,7 +162,7 @@ class ImageStore:
     def prefetch(self, name: str) -> None:
         """Start copying an image to the device in the background, where it waits for `get`.
 
-        At most `AHEAD` images wait; an older one is copied again by `get`.
+        At most `AHEAD` images and `AHEAD_BYTES` wait; an older one is copied again by `get`.
 
         Raises:
             KeyError: there is no such image.
@@ -173,7 +175,7 @@ class ImageStore:
         else:
             self._coming[name] = Future()
             self._coming[name].set_result(self._bring(image.stored))
-        if len(self._coming) > AHEAD:
+        while len(self._coming) > 1 and (len(self._coming) > AHEAD or self._bytes_coming > AHEAD_BYTES):
             self._coming.pop(next(iter(self._coming))).cancel()
 
     def get(self, *names: str) -> Tensor:
@@ -213,8 +215,12 @@ class ImageStore:
         """Bytes on the GPU: images stored there, or prefetched ones."""
         if self._stream is None:
             return 0
-        there = self._images if self._where == "gpu" else self._coming
-        return sum(self._num_bytes(self._images[name]) for name in there)
+        return sum(map(self._num_bytes, self._images.values())) if self._where == "gpu" else self._bytes_coming
+
+    @property
+    def _bytes_coming(self) -> int:
+        """Bytes of prefetched images."""
+        return sum(self._num_bytes(self._images[name]) for name in self._coming)
 
     def close(self) -> None:
         """Drop all images and remove the files."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -14,6 +15,13 @@ from lapgs_plugin.progress import item_progress
 
 ProgressCallback = Callable[[int, int], None]
 """Called with the number of finished items and their total."""
+
+MOST_READERS = 16
+"""Most threads that read images."""
+READING_BYTES = 4 << 30
+"""Most bytes of images that are decoded at once."""
+DECODING = 2 * 3 * 4
+"""Bytes that decoding a pixel takes at most: the image as float32, and the same while it is resized."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -52,8 +60,7 @@ def in_threads(
     """
     results = []
     usable = usable_processors()
-    # One thread an item: torch's own threads would compete with these.
-    pool = ThreadPoolExecutor(min(usable, most or usable), initializer=torch.set_num_threads, initargs=(1,))
+    pool = _pool(min(usable, most or usable))
     with bar(title, unit, progress, len(items)) as seen:
         try:
             for done, future in enumerate([pool.submit(work, item) for item in items], start=1):
@@ -62,3 +69,38 @@ def in_threads(
         finally:
             pool.shutdown(cancel_futures=True)
     return results
+
+
+def ahead(work: Callable[[_Item], _Result], items: Iterable[_Item], *, most: int) -> Iterator[_Result]:
+    """Yield the results of `work` for all items in order, while threads work on the items that follow.
+
+    Args:
+        work: function of an item.
+        items: its arguments.
+        most: number of threads, and of results that are being made or wait. Memory holds one more: the last yielded.
+
+    Raises:
+        Exception: that of the first item whose `work` raised; items after it may have been worked on.
+    """
+    threads = max(1, min(most, usable_processors()))
+    pool, coming = _pool(threads), deque[Future[_Result]]()
+    try:
+        for item in items:
+            if len(coming) == threads:
+                yield coming.popleft().result()
+            coming.append(pool.submit(work, item))
+        while coming:
+            yield coming.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def readers_of(sizes: Iterable[tuple[int, int]]) -> int:
+    """Return how many threads may read images of these (width, height) at once, so that memory stays bounded."""
+    most_pixels = max((width * height for width, height in sizes), default=1)
+    return max(1, min(MOST_READERS, READING_BYTES // (DECODING * most_pixels)))
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    # One thread an item: torch's own threads would compete with these.
+    return ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))

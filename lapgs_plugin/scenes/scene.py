@@ -38,11 +38,10 @@ from lapgs_plugin.scenes.masks import (
     refuse_photos,
     resolve_masks,
 )
-from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads
+from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads, readers_of
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
-MAX_WORKERS = 16
 LEAST_PLACES = NEIGHBOURS + 1
 SAMPLED_POINTS = 10_000
 """Most points of which depths are measured."""
@@ -226,8 +225,8 @@ def load_scene(
         return View(frame.name, camera, image, None if inside is None else mask)
 
     items = list(zip(frames, cameras, strict=True))
-    shown = progress and read
-    views = in_threads("Reading images", "images", load, items, most=MAX_WORKERS, progress=shown)
+    shown, readers = progress and read, readers_of(camera.size for camera in cameras)
+    views = in_threads("Reading images", "images", load, items, most=readers, progress=shown)
     if masks == ALPHA and not any(view.masked for view in views):
         raise UserInputError(
             f"--masks alpha: no image of {path} has transparent pixels; leave the option out, which uses "
@@ -256,7 +255,8 @@ def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = Tru
     def held(view: View) -> View:
         return View(view.name, view.camera, view.image, view.mask)
 
-    return in_threads("Reading images", "images", held, views, most=MAX_WORKERS, progress=progress)
+    readers = readers_of(view.camera.size for view in views)
+    return in_threads("Reading images", "images", held, views, most=readers, progress=progress)
 
 
 def load_cameras(

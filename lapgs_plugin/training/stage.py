@@ -510,8 +510,12 @@ class StageRun:
         return self._views[self._steps.view(iteration)]
 
     def _prefetch(self, planned: _Planned) -> None:
-        """Copy the images of the next launch to the device while this one renders."""
+        """Copy the images of the next launch to the device while this one renders; files of those that follow, too."""
         names = [view.name for view in planned.views[:AHEAD]]
+        if self._settings.images_on == "disk":
+            after = max(planned.iterations) + 1
+            later = range(after, min(after + AHEAD - len(names), self.stage.iterations + 1))
+            names += [self._view(iteration).name for iteration in later]
         self.images.photos.prefetch(*names)
         if self.images.predictions is not None:
             for name in names:

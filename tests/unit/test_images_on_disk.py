@@ -14,6 +14,7 @@ from PIL import Image
 
 from lapgs_plugin.checkouts.level_views import FullSizeImage, SceneImages
 from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.runs.image_store import AHEAD, ImageStore
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -66,6 +67,32 @@ def test_training_holds_no_more_images_of_more_photos(tmp_path: Path) -> None:
     photo = 3 * 4 * SIZE[0] * SIZE[1]
     assert in_memory[0] > 32 * photo
     assert on_disk[32][0] <= on_disk[8][0] + 2 * photo
+
+
+def test_files_are_read_several_views_ahead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, uses = masked_scene(tmp_path / "scene", 16), []
+    waiting: set[str] = set()
+    prefetch, get = ImageStore.prefetch, ImageStore.get_stored
+
+    def noted_prefetch(self: ImageStore, name: str) -> None:
+        waiting.add(name)
+        prefetch(self, name)
+
+    def noted_get(self: ImageStore, *names: str) -> torch.Tensor:
+        uses.extend((name, frozenset(waiting)) for name in names)
+        image = get(self, *names)
+        waiting.difference_update(names)
+        return image
+
+    loaded = load_scene(scene, masks="none", progress=False, hold=False)  # without masks there is one store
+    few = replace(loaded, points=loaded.points[:200], colors=loaded.colors[:200])
+    monkeypatch.setattr(ImageStore, "prefetch", noted_prefetch)
+    monkeypatch.setattr(ImageStore, "get_stored", noted_get)
+    train(tmp_path / "run", few, replace(SETTINGS, iterations=24, levels=1, images_on="disk", views_per_step="1"))
+    order = [name for name, _ in uses]
+    assert len(order) == 24
+    for number, (_, asked_for) in enumerate(uses[1:-AHEAD], start=2):  # nothing comes before the first view
+        assert {*order[number : number + AHEAD - 2]} - {order[number - 1]} <= asked_for
 
 
 def test_a_view_of_a_scene_that_holds_no_images_reads_them(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import mmap
 import os
 import random
@@ -20,7 +21,9 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.runs import image_store
 from lapgs_plugin.runs.image_store import AHEAD, ImageStore, PageLocked, choose_place
+from tests.waiting import wait_for
 
 ITEM_SIZE = {"float32": 4, "float16": 2, "uint8": 1}
 
@@ -132,6 +135,26 @@ def test_prefetching_changes_no_image(tmp_path: Path, device: str, where: str) -
     for ask in (kept.get, kept.prefetch):
         with pytest.raises(KeyError):
             ask("5")
+
+
+@pytest.mark.parametrize(("room", "kept_images"), [(1, 1), (3, 3), (100, AHEAD)])
+def test_prefetched_images_are_few_and_of_few_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, kept_images: int
+) -> None:
+    shape = (3, 37, 41)
+    monkeypatch.setattr(image_store, "AHEAD_BYTES", room * 4 * math.prod(shape))
+    with store(tmp_path, "disk", "float32") as kept:
+        for number in range(3 * AHEAD):
+            kept.put(str(number), torch.full(shape, float(number)))
+        for number in range(3 * AHEAD):
+            kept.prefetch(str(number))
+
+        def images_in_memory() -> int:
+            alive = (one for one in gc.get_objects() if type(one) is torch.Tensor and one.shape == shape)
+            return len({one.data_ptr() for one in alive})
+
+        wait_for(lambda: images_in_memory() == kept_images)  # reading those that were dropped has ended
+        assert all(kept.get(str(number))[0, 0, 0] == number for number in range(3 * AHEAD))
 
 
 @on_every_device
