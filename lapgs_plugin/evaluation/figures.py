@@ -46,7 +46,7 @@ from lapgs_plugin.runs.layout import METRICS
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.runs.results import MEASURED
 from lapgs_plugin.runs.training_figures import VIEW_PSNR, training_figures
-from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.scenes.scene import View, with_pixels
 
 METRIC_KEYS = {
     *("psnr", "fitted_psnr", "ssim", "lpips_missing", "fps", "split", "num_views", "views", "levels"),
@@ -97,7 +97,9 @@ def evaluate_run(
         with item_progress("views") as progress:
             measured = [
                 _measure_view(view, renderer.render(view.camera), renderer, distances, exposures.get(view.name))
-                for view in progress.track(photos, description=f"Measuring {MEASURED[split]} views")
+                for view in progress.track(
+                    with_pixels(photos), total=len(photos), description=f"Measuring {MEASURED[split]} views"
+                )
             ]
         speed = composed_speed(renderer, [view.camera for view in photos[:FPS_VIEWS]], FPS_ROUNDS)
     views, records = [figures for figures, _ in measured], archive.manifest.records

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -38,7 +38,7 @@ from lapgs_plugin.scenes.masks import (
     refuse_photos,
     resolve_masks,
 )
-from lapgs_plugin.scenes.parallel import ProgressCallback, in_threads, readers_of
+from lapgs_plugin.scenes.parallel import ProgressCallback, ahead, in_threads, readers_of
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
 from lapgs_plugin.scenes.source import LARGEST, Frame, SceneSource
 
@@ -103,9 +103,26 @@ class View:
         """Whether there is a mask, which is not read."""
         return vars(self)["_mask"] is not None
 
+    @property
+    def on_disk(self) -> bool:
+        """Whether the image is read at each access."""
+        return callable(vars(self)["_image"])
+
     def at(self, camera: Camera) -> View:
         """Return the view with another camera of the same size."""
         return View(self.name, camera, vars(self)["_image"], vars(self)["_mask"])
+
+
+def with_pixels(views: Sequence[View]) -> Iterator[View]:
+    """Yield views that hold their images. Threads read ahead those that are on the disk.
+
+    Raises:
+        SceneError: an image or a mask cannot be read any more.
+    """
+    if not any(view.on_disk for view in views):
+        return iter(views)
+    readers = readers_of(view.camera.size for view in views)
+    return ahead(lambda view: View(view.name, view.camera, view.image, view.mask), views, most=readers)
 
 
 @dataclass(frozen=True)

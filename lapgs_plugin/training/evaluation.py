@@ -15,7 +15,7 @@ from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.runs.neighbours import predicted_exposures
-from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatch, copied, spread_views
 from lapgs_plugin.training.stage import StageRun
@@ -88,7 +88,8 @@ class StageEvaluation:
     def _psnrs(self, views: Sequence[View], exposures: Mapping[str, Tensor] | None = None) -> dict[str, ViewPsnr]:
         """Measure views, each on the rank that has its image, and return the figures by name in their order."""
         prepared, exposures = self.run.prepared, exposures or {}
-        own = {view.name: self._psnr(view, exposures.get(view.name)) for view in prepared.owned(views)}
+        photos = with_pixels(prepared.owned(views))
+        own = {view.name: self._psnr(view, exposures.get(view.name)) for view in photos}
         measured = {name: psnr for one in prepared.ranks.gathered(own) for name, psnr in one.items()}
         return {view.name: measured[view.name] for view in views}
 

@@ -19,8 +19,7 @@ from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
-from lapgs_plugin.scenes.parallel import ahead, readers_of
-from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.depth import StageDepth
@@ -68,23 +67,14 @@ def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, An
 
 
 def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
-    """Return the images of a stage with the photos of its training views, on a CPU as float32.
-
-    Photos that the scene does not hold are read by several threads ahead.
-    """
+    """Return the images of a stage with the photos of its training views, on a CPU as float32."""
     views, on_gpu = run.owned(run.scene.train), run.device.type == "cuda"
-    sizes = sizes_of(views)
-    readers = readers_of(sizes.values())
-
-    def has_eight_bits(view: View) -> bool:
-        return eight_bit_levels(view.image) is not None
-
-    eight_bit = on_gpu and stage.level == 0 and all(ahead(has_eight_bits, views, most=readers))
+    eight_bit = on_gpu and stage.level == 0
+    eight_bit = eight_bit and all(eight_bit_levels(view.image) is not None for view in with_pixels(views))
     masked = any(view.masked for view in run.scene.train)  # on every rank or on none
-    images = StageImages(run, stage, sizes, eight_bit=eight_bit, masked=masked, exact=not on_gpu)
-    pixels = ahead(lambda view: (view.image, view.mask), views, most=readers)
-    for view, (image, mask) in zip(views, pixels, strict=True):
-        images.photos.put(view.name, image, mask)
+    images = StageImages(run, stage, sizes_of(views), eight_bit=eight_bit, masked=masked, exact=not on_gpu)
+    for view in with_pixels(views):
+        images.photos.put(view.name, view.image, view.mask)
     return images
 
 

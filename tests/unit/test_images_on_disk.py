@@ -16,7 +16,7 @@ from lapgs_plugin.checkouts.level_views import FullSizeImage, SceneImages
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runs.image_store import AHEAD, ImageStore
 from lapgs_plugin.scenes import load_scene
-from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.cli.run_folder import write_scene
 from tests.training_runs import plys, train
@@ -109,6 +109,12 @@ def test_a_view_of_a_scene_that_holds_no_images_reads_them(tmp_path: Path) -> No
         assert moved.camera.fx == 9.0
         image = weakref.ref(other.image)
         assert image() is None, "kept by nobody"
+    assert [view.on_disk for view in held.train] == [False] * 4
+    for view, other in zip(held.train, with_pixels(read.train), strict=True):
+        assert not other.on_disk
+        assert other.image is other.image
+        assert torch.equal(view.image, other.image)
+    assert list(with_pixels(held.train)) == list(held.train)
     assert not View("a", ring_camera(0.0), torch.zeros(3, *SIZE[::-1])).masked
 
 
