@@ -515,7 +515,8 @@ class StageRun:
         if self._settings.images_on == "disk":
             after = max(planned.iterations) + 1
             later = range(after, min(after + AHEAD - len(names), self.stage.iterations + 1))
-            names += [self._view(iteration).name for iteration in later]
+            own = sorted(iteration for part in self._steps.parts(later) for iteration in part)
+            names += [self._view(iteration).name for iteration in own]
         self.images.photos.prefetch(*names)
         if self.images.predictions is not None:
             for name in names:
