@@ -141,7 +141,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
 
-    def invented(evaluation: StageEvaluation, view: View) -> ViewPsnr:
+    def invented(evaluation: StageEvaluation, view: View, exposure: Tensor | None) -> ViewPsnr:
         run = evaluation.run
         assert view.name in aside
         assert run.exposures is not None
