@@ -159,7 +159,7 @@ def _train(spec: RunSpec, scene: Path, folder: Path) -> tuple[str, ...]:
         *("--iterations", str(spec.iterations), "--resolution", spec.resolution, "--images", spec.images),
         *("--seed", str(spec.seed), "--rasterizer", spec.rasterizer),
         # Backbones compensate no exposure, and tables compare views without compensation.
-        *_as_options({"exposure": "off", **spec.options, **levels}),
+        *_as_options({"appearance": "none", **spec.options, **levels}),
     )
 
 

@@ -89,7 +89,7 @@ def _names_iterations(path: Path) -> bool:
 def run_spec(method: Method, settings: ParetoSettings, scene: Path, iterations: int, seed: int) -> RunSpec:
     """Describe a run of a method with so many iterations."""
     # Quality is compared after the colour fit too, so `lapgs train` compensates exposure as it does by default.
-    options: dict[str, Any] = {"exposure": "auto"} if method.checkout is None else {"device": settings.device}
+    options: dict[str, Any] = {"appearance": "auto"} if method.checkout is None else {"device": settings.device}
     if method.hierarchy is not None:
         options["hierarchy"] = method.hierarchy.value
     return RunSpec(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lapgs_plugin import __version__
+from lapgs_plugin.cli.usage import REPLACED
 from lapgs_plugin.errors import LapgsError, RunFolderError, UserInputError, nearest, printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.runs.layout import RUN_CONFIG
@@ -89,6 +90,8 @@ def _read(context: typer.Context, path: Path) -> dict[str, Any]:
     for key, value in read_toml(path, dict[str, Any]).items():
         name = key.replace("-", "_")
         if (option := name.replace("_", "-")) not in known:
+            if option in REPLACED:
+                raise UserInputError(f"{path}: {key} is no option any more; give {REPLACED[option]}")
             all_of_them = f"{context.command_path} --help lists them"
             raise UserInputError(
                 f"{path}: {key} is not an option of {context.command_path} that a settings file may have; "

@@ -18,6 +18,8 @@ PLAIN = {
     "Input should be": "expected",
 }
 """Our words for pydantic's."""
+REPLACED = {"exposure": "--appearance (none, affine or bilateral; before: off, on)"}
+"""Options that other ones took the place of, which files and scripts of users may still have."""
 WITH_BASELINE = ("report", "view")
 """Commands that show one run, and a second one by --baseline."""
 
@@ -54,4 +56,6 @@ def one_line_usage_errors(context: Any = None) -> Iterator[None]:
                 f"{usage_message(error)}; expected one run, to compare it with another: {command} RUN --baseline OTHER"
             ) from error
         said = usage_message(error)
+        if (name := str(getattr(error, "option_name", "")).lstrip("-")) in REPLACED:
+            raise UserInputError(f"no such option: --{name}; give {REPLACED[name]}") from error
         raise UserInputError(f"{said}{' See' if said.endswith('?') else '; see'} `{command} --help`") from error

@@ -22,6 +22,9 @@ PLACES = ("gpu", "memory", "disk")
 PRECISIONS = ("float32", "float16", "uint8")
 AUTO = "auto"
 """Chosen by the device and the images' size."""
+AFFINE, BILATERAL = "affine", "bilateral"
+APPEARANCES = (AFFINE, BILATERAL)
+"""What can be learned of each photo with --appearance: a colour transform, or a bilateral grid of them."""
 
 COARSE_THRESHOLD = {Hierarchy.NESTED: 2.0, Hierarchy.LAPLACIAN: 1.0}
 """Default factor on densification thresholds for each halving of the images. Coarse levels would otherwise grow more
@@ -298,6 +301,19 @@ class HierarchySettings:
             return None
         first = stage.iterations - round(stage.iterations * self.joint_share) + 1
         return first if first <= stage.iterations else None
+
+
+def require_composed(appearance: str, supervision: str) -> None:
+    """Refuse transforms of an image that is not compared with the photo.
+
+    Raises:
+        UserInputError: `appearance` is one of `APPEARANCES`, and `supervision` compares residuals alone.
+    """
+    if appearance in APPEARANCES and not SUPERVISIONS[supervision].composes:
+        raise UserInputError(
+            f"--appearance {appearance} with --supervision {supervision}: that compares residuals, which have no "
+            "exposure; leave one out"
+        )
 
 
 def parse_split(text: str) -> tuple[Fraction, ...]:

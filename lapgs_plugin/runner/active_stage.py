@@ -131,6 +131,7 @@ class ActiveStage(RunningStage):
     def iteration_begins(self, gaussians: Any) -> None:
         iteration = self.iteration + 1
         self.record.start_clock()
+        self._step_appearance()
         self._show(gaussians, iteration - 1)
         self.record.breakdown.mark("other")
         every = self._context.request.measuring.test_every
@@ -209,6 +210,7 @@ class ActiveStage(RunningStage):
             LapgsError: training left nothing to archive, or NaN or inf.
         """
         gaussians, self.gaussians = self.gaussians, None  # an error from here on does not archive it again
+        self._step_appearance()
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
         field = self._exported(gaussians, self.stage.signed)
@@ -217,7 +219,15 @@ class ActiveStage(RunningStage):
         inherited = {"carried": self._model.carried(gaussians), "moments": self._model.moments(gaussians)}
         result = self._result(gaussians, field, **inherited)
         inherits = self.stage.level > 0 and any(inherited.values())
-        self._archive.finish_level(self.record.of_level(len(field)), field, inherited if inherits else None, joint)
+        appearance = self._views.appearance
+        self._archive.finish_level(
+            self.record.of_level(len(field)),
+            field,
+            inherited if inherits else None,
+            joint,
+            exposure=None if appearance is None else appearance.archived(),
+            grids=None if appearance is None else appearance.archived_grids(),
+        )
         if self._views.test and (self.stage.level <= 1 or self._context.request.measuring.test_every is not None):
             self._evaluate(gaussians)
         for line in self.record.weak_lines():
@@ -302,6 +312,11 @@ class ActiveStage(RunningStage):
     def _exported(self, gaussians: Any, signed: bool) -> GaussianField:
         """Return a model's field for the archive, on the CPU."""
         return self._adapter.export_field(gaussians, signed).to("cpu")
+
+    def _step_appearance(self) -> None:
+        """Step what is learned of the photos after the last iteration, if that ended a pass through them."""
+        if self._views.appearance is not None and self.iteration > 0:
+            self._views.appearance.after_step(self.iteration, 1)
 
     def _show(self, gaussians: Any, iteration: int) -> None:
         """Show the fields after an iteration to the run's watcher if it wants to look."""

@@ -19,6 +19,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.rasterizers.signed_color import ColorPath
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext, TrainingRun
 from lapgs_plugin.runner.dry_run import DryRun, full_gpu_told
@@ -50,6 +51,10 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
     settings = request.settings
     adapter.refuse(call, settings.has_residuals)
     require_pruning(call, settings.prune, adapter.profile.model)
+    if settings.appearance != NONE and getattr(call.dataset, "train_test_exp", False):
+        raise UserInputError(
+            f"--appearance {settings.appearance} with --train_test_exp: both learn each photo's exposure; leave one out"
+        )
     unnamed = Path("output", os.getenv("OAR_JOB_ID") or str(uuid.uuid4())[:10])  # as checkouts choose without -m
     folder, source = Path(call.dataset.model_path or unnamed), Path(call.dataset.source_path)
     absolute = folder.absolute()
@@ -79,7 +84,7 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
             path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
             if settings.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
-            elif not settings.has_residuals and (context.hooks or images.masked):
+            elif not settings.has_residuals and (context.hooks or images.masked or settings.appearance != NONE):
                 dry_run.find_image()
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test), rasterizer)
         with _open_archive(context, absolute, manifest) as archive:

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
-from lapgs_plugin.hierarchy.settings import JOINT_SHARE, PANEL, STORAGE, HierarchySettings, is_large
+from lapgs_plugin.hierarchy.settings import (
+    APPEARANCES,
+    JOINT_SHARE,
+    PANEL,
+    STORAGE,
+    HierarchySettings,
+    is_large,
+    require_composed,
+)
 from lapgs_plugin.options import option, require_positive
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.runs.options import PANEL as RUN_PANEL
 
 ELSEWHERE = ("levels", "grid", "supervision", "inherit", "seed", "masks", "dry_run")
@@ -54,6 +64,14 @@ class RunSettings(HierarchySettings):
         names=("--run-ahead/--no-run-ahead",),
     )
 
+    appearance: str = option(
+        NONE,
+        "Learn how each training photo differs from the scene. affine: a colour transform, against changes of exposure "
+        "and white balance. bilateral: a grid of them over the image and brightness, also against vignetting and local "
+        "tone mapping. Renders show the mean exposure.",
+        panel=PANEL,
+        choices=(NONE, *APPEARANCES),
+    )
     dry_run: bool = option(
         True,
         "Before the first stage, try one iteration of the checkout and everything that the run does with its model.",
@@ -70,6 +88,12 @@ class RunSettings(HierarchySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive("--sh-rate", self.sh_rate, "factor")
+        require_composed(self.appearance, self.supervision)
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """See `HierarchySettings.paper_settings`."""
+        return {**super().paper_settings, "appearance": NONE}
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:

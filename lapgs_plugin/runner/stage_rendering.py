@@ -62,7 +62,9 @@ class StageRendering:
         composed: keys of the views to compose; the residuals of all others are compared with a residual.
         on_image: called when gradients are recorded with key, composed image, and the upsampled prediction in it (None
             without composition); returns the image to use instead.
-        capture: keep the last call in `captured`.
+        as_photographed: called with key and composed image; returns the image with the appearance of its photo, which
+            the loop compares with the photo. None with `--appearance none`.
+        capture: keep the last call in `captured`, its image without the appearance of a photo.
     """
 
     signed: bool
@@ -73,6 +75,7 @@ class StageRendering:
     masked: frozenset[str] = frozenset()
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
+    as_photographed: Callable[[str, Tensor], Tensor] | None = None
     capture: bool = False
     captured: Captured | None = field(default=None, repr=False)
     _told: bool = field(default=False, repr=False)
@@ -94,12 +97,13 @@ class StageRendering:
             return None
         keys = self._keys_by_matrix(settings)
         # Photos of one camera have the same prediction, but not the same mask or target.
-        differ = self.masked or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
+        differ = self._needs_photos or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
         if len(keys) > 1 and differ:
             names = " and ".join(view_name(key) for key in sorted(keys)[:2])
             raise UserInputError(
                 f"{names} have the same camera, and the checkout's rasterizer gets only that: which photo it renders "
-                "is unknown; leave one of them out, or train with --hierarchy nested, without --masks and hooks"
+                "is unknown; leave one of them out, or train with --hierarchy nested, without --masks, "
+                "--appearance and hooks"
             )
         return min(keys, default=None)
 
@@ -176,6 +180,8 @@ class StageRendering:
             image = add_prediction(image, below)
         if self.on_image is not None and torch.is_grad_enabled():
             image = self.on_image(key, image, below)
+        if self.as_photographed is not None and not self.capture:
+            image = self.as_photographed(key, image)
         if self.images is not None and key in self.masked and not self.capture:
             # Outside of the mask any loss then compares the target with itself.
             image = fill_outside(image, self.target(key), self.images.get_weights(key))
@@ -244,7 +250,12 @@ class StageRendering:
     @property
     def _needs_views(self) -> bool:
         """Whether training on an image of no known view would train something else."""
-        return self.signed or bool(self.masked)
+        return self.signed or self._needs_photos
+
+    @property
+    def _needs_photos(self) -> bool:
+        """Whether images are trained otherwise for each photo."""
+        return bool(self.masked) or self.as_photographed is not None
 
     @property
     def _below_target(self) -> Predictions | None:
@@ -267,5 +278,5 @@ def _refuse_unrecognised(_: Tensor) -> None:
     raise UserInputError(
         "the checkout trains on a camera that is no view of its scene: no renderer was called with one, and the "
         "rasterizer's matrices are none of the scene's; so no residual can be composed with coarser levels, nor a "
-        "mask be applied: train with --hierarchy nested and without --masks"
+        "mask or an appearance be applied: train with --hierarchy nested and without --masks and --appearance"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -10,13 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.checkouts.level_views import PrefetchingViews
+from lapgs_plugin.checkouts.level_views import PrefetchingViews, view_name
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.evaluation.metrics import psnr, qualities
 from lapgs_plugin.hierarchy.plan import Stage, level_size
+from lapgs_plugin.ops.mixed_sizes import largest_size
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.runner.context import TrainingRun
 from lapgs_plugin.runner.stage_rendering import Captured, StageRendering
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
+from lapgs_plugin.stages.appearance import KINDS, ViewAppearance, identities
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.joint import RenderedPredictions
 
@@ -36,6 +39,7 @@ class StageViews:
         sizes: (width, height) of their photos by key.
         train, test: keys of the training and of the held-out views.
         images: photos and predictions of all views; photos only after `load_images`.
+        appearance: learned of each training view; None with `--appearance none`.
         rendering: the stage as the wrapped rasterizer sees it.
     """
 
@@ -52,11 +56,13 @@ class StageViews:
             {photos.key(camera): camera for camera in cameras} for cameras in (run.scene.train, run.scene.test)
         )
         self.cameras, self.train, self.test = {**train, **test}, list(train), list(test)
+        self._training = frozenset(train)
         self.sizes = {key: photos[key].size for key in self.cameras}
         self._views: dict[str, Any] = {}
         self._changed: dict[str, set[str]] = {}  # attributes of each view that depend on the level
         self.images = StageImages(run, stage, self.sizes, eight_bit=photos.exact, masked=photos.masked)
         self.images.predictions = self.images.held_out = predictions
+        self.appearance = _first_appearance(run, stage, {view_name(key): self.sizes[key] for key in train})
         self.rendering = StageRendering(
             signed=stage.signed,
             path=run.color_path,
@@ -66,14 +72,15 @@ class StageViews:
             masked=frozenset(train if photos.masked else ()),
             composed=frozenset(self.cameras if run.supervision.composes else test),
             on_image=run.context.hooks.on_image if run.context.hooks else None,
+            as_photographed=None if self.appearance is None else self._as_photographed,
         )
 
     def load_images(self) -> None:
         """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""
-        photos, training = self._context.images, set(self.train)
+        photos = self._context.images
         for key in self.cameras:
             photo = photos[key].load(self._run.device)
-            self.images.photos.put(key, photo, photos.mask(key), with_coarse=key in training)
+            self.images.photos.put(key, photo, photos.mask(key), with_coarse=key in self._training)
 
     def size(self, key: str, level: int) -> tuple[int, int]:
         """Return (width, height) of a view's image at a level."""
@@ -156,7 +163,23 @@ class StageViews:
         self._changed[key] = {name for name, value in vars(view).items() if value is not before.get(name, self)}
         return view
 
+    def _as_photographed(self, key: str, image: Tensor) -> Tensor:
+        """Return the composed image (3, h, w) of a view with the appearance of its photo if it is a training view."""
+        assert self.appearance is not None, "else it is not called"
+        return self.appearance.apply([view_name(key)], image) if key in self._training else image
+
     def _composed(self, gaussians: Any, key: str) -> Tensor:
         """Return I_hat^l (3, h, w) of a view, before exposure and clamping."""
         rendering = replace(self.rendering, composed=frozenset(self.cameras), capture=True)
         return self._context.render(rendering, self._call, self._view(key), gaussians).image
+
+
+def _first_appearance(run: TrainingRun, stage: Stage, photos: Mapping[str, tuple[int, int]]) -> ViewAppearance | None:
+    """Return what a stage starts with: what the coarser level learned of photos, by name with their sizes."""
+    if (choice := run.settings.appearance) == NONE:
+        return None
+    kind, names, levels = KINDS[choice], list(photos), run.archive.available_levels
+    start = kind.read(run.archive, levels[-1], names) if levels else None
+    if start is None:
+        start = kind.uniform(identities(len(names)), largest_size(list(photos.values())))
+    return kind.create(names, start, run.device, run.plan.iterations_before(stage.level), run.plan.iterations)

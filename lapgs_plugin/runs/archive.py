@@ -7,7 +7,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 from pydantic import Field
+from torch import Tensor
 
 from lapgs_plugin.errors import FieldError, RunFolderError
 from lapgs_plugin.fields.gaussian_field import GaussianField, count_gaussians
@@ -16,6 +18,7 @@ from lapgs_plugin.runs.layout import (
     CHECKPOINT,
     EXPOSURE,
     EXTENDED,
+    GRIDS,
     METRICS,
     OPTIMIZER,
     PLY,
@@ -39,6 +42,8 @@ from lapgs_plugin.untrusted import read_json
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Exposures = dict[str, Annotated[list[Row], Field(min_length=3, max_length=3)]]
 """Affine colour transforms by photo, three rows of four numbers each: colours of the scene to colours of the photo."""
+Grids = dict[str, Tensor]
+"""Bilateral grids by photo, as `ops.bilateral_grid` describes them."""
 Poses = dict[str, Annotated[list[float], Field(min_length=6, max_length=6)]]
 """Corrections of poses by photo, as `fields.pose` describes them: a rotation vector, and a shift in world units."""
 
@@ -164,6 +169,7 @@ class RunArchive(RunFiles):
         trained_along: Mapping[int, GaussianField] | None = None,
         exposure: Exposures | None = None,
         poses: Poses | None = None,
+        grids: Grids | None = None,
     ) -> None:
         """Write a trained level: first its PLY, then the manifest that lists it; remove its checkpoint.
 
@@ -179,6 +185,7 @@ class RunArchive(RunFiles):
             trained_along: finished fields after joint training, by level, each with as many Gaussians as before.
             exposure: colour transforms of the training photos by name; None without compensation.
             poses: corrections of their poses; None without refinement.
+            grids: bilateral grids of the training photos; None without.
 
         Raises:
             FieldError: a field holds NaN or inf, or is not the one that its record describes; nothing is written.
@@ -209,6 +216,8 @@ class RunArchive(RunFiles):
             for name, learned in ((EXPOSURE, exposure), (POSES, poses)):
                 if learned is not None:
                     self._write_json(path.with_name(name), dict(learned), training=True)
+            if grids is not None:
+                write_tensors(path.with_name(GRIDS), grids)
             if optimizer_state is not None:
                 write_tensors(path.with_name(OPTIMIZER), optimizer_state)
         record = replace(record, overhead_seconds=dict(overhead))
@@ -236,6 +245,7 @@ class RunArchive(RunFiles):
         fields: Mapping[int, GaussianField],
         exposure: Exposures | None,
         poses: Poses | None,
+        grids: Grids | None,
         settings: Mapping[str, Any],
     ) -> None:
         """Replace fields and the finest level's record of a finished run that was trained further, all at once.
@@ -246,7 +256,7 @@ class RunArchive(RunFiles):
         Args:
             record: of level 0.
             fields: by level, each with as many Gaussians as before; others stay.
-            exposure, poses: see `finish_level`.
+            exposure, poses, grids: see `finish_level`.
             settings: that changed, with "iterations".
 
         Raises:
@@ -265,6 +275,8 @@ class RunArchive(RunFiles):
             if learned is not None:
                 path = self._extended_path(record.level, name, iterations)
                 self._write_json(path, dict(learned), training=True)
+        if grids is not None:
+            write_tensors(self._extended_path(record.level, GRIDS, iterations), grids)
         self._remove(METRICS, STABILITY, REPORT)
         self._write_manifest(manifest)
         self._settle_fields()
@@ -323,12 +335,35 @@ class RunArchive(RunFiles):
         learned: Poses | None = self._learned(level, POSES, Poses)
         return learned
 
+    def grids(self, level: int) -> Grids | None:
+        """Read the bilateral grids of the training photos after a finished level; None without.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        advice = "train again with --overwrite"
+        if (path := self._learned_path(level, GRIDS)) is None:
+            return None
+        learned = read_tensors(path, advice)
+        shapes = {getattr(grid, "shape", None) for grid in learned.values()}
+        for name, grid in learned.items():
+            fits = isinstance(grid, Tensor) and grid.dtype == torch.float32 and grid.ndim == 4 and len(grid) == 12
+            if not (fits and grid.numel() > 0 and len(shapes) == 1 and bool(torch.isfinite(grid).all())):
+                raise RunFolderError(
+                    f"{path}: {name} is no bilateral grid, expected finite float32 (12, l, y, x), of one shape for all "
+                    f"photos; {advice}"
+                )
+        return learned
+
     def _learned(self, level: int, name: str, kind: Any) -> Any:
-        """Read a file about the training photos that a level wrote; None if it has none."""
-        path = next(filter(exists, (self._extended_path(level, name), self.path(f"level_{level}", name))), None)
-        if path is None:
+        """Read a JSON file about the training photos that a level wrote; None if it has none."""
+        if (path := self._learned_path(level, name)) is None:
             return None
         return read_json(path, kind, error=RunFolderError, advice="train again with --overwrite")
+
+    def _learned_path(self, level: int, name: str) -> Path | None:
+        """Return a file about the training photos that a level wrote, or an extension of it; None if it has none."""
+        return next(filter(exists, (self._extended_path(level, name), self.path(f"level_{level}", name))), None)
 
     def _check_fields(self) -> None:
         for record in self._manifest.records:

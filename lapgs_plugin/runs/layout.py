@@ -4,7 +4,8 @@
     RUN/view_cameras.json          cameras of the run's views where they are not those of its scene
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
-    RUN/level_<l>/view_colors.json colour transforms of the training photos after that level, if exposure is compensated
+    RUN/level_<l>/view_colors.json colour transforms of the training photos after that level, with --appearance
+    RUN/level_<l>/view_grids.pt    bilateral grids of the training photos after that level, with --appearance bilateral
     RUN/level_<l>/view_poses.json  corrections of the training photos' poses after that level, if these are refined
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
@@ -52,6 +53,7 @@ RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 CAMERAS = "view_cameras.json"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
+GRIDS = "view_grids.pt"
 TRAINED_ALONG = "point_cloud.with_level_{}.ply"
 """The PLY of a finished field after joint training with a finer level, until it replaces `PLY`."""
 FORGET_EXTENSION = "delete it to extend the run anew"
@@ -195,7 +197,7 @@ def remove_results(folder: Path) -> None:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
     for level in folder.glob("level_*/"):
-        for name in (PLY, OPTIMIZER, EXPOSURE, POSES):
+        for name in (PLY, OPTIMIZER, EXPOSURE, GRIDS, POSES):
             (level / name).unlink(missing_ok=True)
         for pattern in (TRAINED_ALONG.format("*"), EXTENDED.format("*", "*")):
             for waiting in level.glob(pattern):

@@ -67,7 +67,7 @@ class ModelState(_State):
 
 
 class TransformsState(_State):
-    """Result of `view_transforms.ViewTransforms.state`."""
+    """Result of `stages.view_transforms.ViewTransforms.state`."""
 
     transforms: Tensor
     gradient: Tensor | None
@@ -81,7 +81,7 @@ class BestState(_State):
     iteration: PositiveInt
     model: ModelState
     joint: dict[int, ModelState] | None
-    exposure: TransformsState | None
+    appearance: TransformsState | None
     poses: NotRequired[TransformsState | None]
 
 
@@ -97,7 +97,7 @@ class StageState(_State):
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
-    exposure: NotRequired[TransformsState | None]
+    appearance: NotRequired[TransformsState | None]
     poses: NotRequired[TransformsState | None]
     best: NotRequired[BestState]
     random: Tensor

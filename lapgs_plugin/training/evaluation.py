@@ -61,7 +61,7 @@ class StageEvaluation:
         if not views:  # after most steps: reading exposures would wait for the GPU
             return {}
         with run.record.overhead.timed("evaluation"):
-            learned = None if run.exposures is None else run.exposures.archived()
+            learned = None if run.appearance is None else run.appearance.archived()
             exposures = {} if learned is None else predicted_exposures(learned, [view.name for view in views])
             psnrs = self._psnrs(views, exposures)
         measured = {"psnr": fmean(each.plain for each in psnrs.values())} if every else {}
@@ -117,13 +117,13 @@ class StageEvaluation:
     def warn_of_a_fall(self, measured: Mapping[str, float]) -> None:
         """Tell the user if held-out views got worse while the training loss fell."""
         run = self.run
-        key = "sampled_psnr" if run.exposures is None else "sampled_fitted_psnr"
+        key = "sampled_psnr" if run.appearance is None else "sampled_fitted_psnr"
         now, level = measured.get(key), run.stage.level
         if now is None or not self.watch.falls(level, now, run.loss):
             return
         helps = ["fewer --iterations", "--masks for what moves or is no part of the scene"]
-        if run.exposures is None and run.prepared.supervision.composes:
-            helps.insert(0, "--exposure on if brightness or colours of the photos change")
+        if run.appearance is None and run.prepared.supervision.composes:
+            helps.insert(0, "--appearance affine if brightness or colours of the photos change")
         self.monitor.say(
             f"level {level}, iteration {run.counts.iteration}: held-out PSNR fell to {now:.1f} dB from "
             f"{self.watch.best:.1f} while the training loss fell; what may help: {', '.join(helps)}"
@@ -134,7 +134,7 @@ class StageEvaluation:
         run, aside, iteration = self.run, self.run.prepared.aside, self.run.counts.iteration
         last = iteration == run.stage.iterations
         with run.record.overhead.timed("evaluation"):
-            fitted = run.exposures is not None
+            fitted = run.appearance is not None
             psnrs = list(self._psnrs(aside).values())
             now = fmean(each.fitted if fitted else each.plain for each in psnrs)
             if self.best is None or now > self.best["psnr"] - (LEAST_GAIN if last else 0.0):

@@ -14,12 +14,12 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
-from lapgs_plugin.ops.mixed_sizes import if_mixed, own_part, own_parts
+from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, own_part, own_parts
 from lapgs_plugin.ops.photometric_loss import photometric_loss
 from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.stages.appearance import ViewAppearance
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.joint import Predictions, RenderedPredictions
-from lapgs_plugin.training.exposure import ViewExposures
 
 LossOf = Callable[[Tensor, GaussianField], Tensor]
 """Computes the mean loss of some views from their renders, (3, h, w) or (b, 3, h, w), and the field rendered."""
@@ -35,7 +35,7 @@ class ViewLosses:
         breakdown: gets the time in which coarser levels are rendered.
         hooks: compose, and compute losses.
         rasterizer: renders more of the field for hooks that ask for it.
-        exposures: colour transforms of the views; None without compensation of exposure.
+        appearance: transforms of the views' images; None with `--appearance none`.
         ssim_weight: share of SSIM in a loss.
     """
 
@@ -44,7 +44,7 @@ class ViewLosses:
     breakdown: Breakdown
     hooks: HookDispatcher
     rasterizer: Rasterizer
-    exposures: ViewExposures | None
+    appearance: ViewAppearance | None
     ssim_weight: float
 
     @cached_property
@@ -67,7 +67,7 @@ class ViewLosses:
 
         def loss(rendered: Tensor, _: GaussianField) -> Tensor:
             composed = rendered if add is None else add(rendered)
-            return photometric_loss(self.exposed(names, composed), target, self.ssim_weight, sizes)
+            return photometric_loss(self.as_photographed(names, composed, sizes), target, self.ssim_weight, sizes)
 
         return loss
 
@@ -82,7 +82,7 @@ class ViewLosses:
         together = self._batches_hooks(cameras)
 
         def of(context: StageContext, shown: Sequence[str], image: Tensor) -> Tensor:
-            return self.hooks.loss(context, self.exposed(shown, self.hooks.compose(context, image)))
+            return self.hooks.loss(context, self.as_photographed(shown, self.hooks.compose(context, image)))
 
         def loss(rendered: Tensor, field: GaussianField) -> Tensor:
             if together:
@@ -133,6 +133,11 @@ class ViewLosses:
         """Return whether hooks are called once for all views, which takes images of one size."""
         return self.hooks.takes_batches and not if_mixed([camera.size for camera in cameras])
 
-    def exposed(self, names: Sequence[str], image: Tensor) -> Tensor:
-        """Return the composed image of a view, or images of several, at the exposure of their photos."""
-        return image if self.exposures is None else self.exposures.apply(names, image)
+    def as_photographed(self, names: Sequence[str], image: Tensor, sizes: Sizes | None = None) -> Tensor:
+        """Return the composed image of a view, or images of several, with the appearance of their photos.
+
+        Args:
+            names, image: of the views.
+            sizes: of views whose sizes differ, see `mixed_sizes`.
+        """
+        return image if self.appearance is None else self.appearance.apply(names, image, sizes)

@@ -20,6 +20,7 @@ from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
@@ -29,7 +30,7 @@ from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.prepared_run import PreparedRun
-from lapgs_plugin.training.settings import OFF, Densification, LearningRates, TrainSettings
+from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
 from lapgs_plugin.training.strategies import GRADIENTS
 from lapgs_plugin.training.trainer import Trainer
 
@@ -140,7 +141,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int, on_gsplat: bo
         sh_degree=sh_degree,
         sh_every=1,
         sh_rate_factor=1.0,
-        exposure=OFF,  # what the run learned of its photos' exposure is part of its images
+        appearance=NONE,  # what the run learned of its photos' exposure is part of its images
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
         densification=Densification(until=0, reset_every=0, strategy=GRADIENTS),  # the field stays as it is

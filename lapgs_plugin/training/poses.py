@@ -21,7 +21,7 @@ from lapgs_plugin.fields.pose import corrected, turned_gradient, with_pose_gradi
 from lapgs_plugin.runs.archive import Poses
 from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.scene import View
-from lapgs_plugin.training.view_transforms import ViewTransforms
+from lapgs_plugin.stages.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView
 
 FIRST_RATE = 0.1

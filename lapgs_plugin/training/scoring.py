@@ -65,7 +65,7 @@ class FieldScoring:
                 below, (target, _) = self.losses.below(), photos.get(view.name)
                 image = image if below is None else image + below.get(view.name)
                 self.breakdown.mark("densification")
-                composed = self.losses.exposed([view.name], image)
+                composed = self.losses.as_photographed([view.name], image)
                 whole = fill_outside(composed, target, photos.get_weights(view.name))
                 loss = photometric_loss(whole, target, ssim_weight)
             return ScoredView(self._render(plain, view, 0), whole, target, loss)

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import REFERENCE_DENSIFY_FROM, REFERENCE_ITERATIONS, Stage
-from lapgs_plugin.hierarchy.settings import AUTO, HierarchySettings, is_large
-from lapgs_plugin.hierarchy.supervision import SUPERVISIONS
+from lapgs_plugin.hierarchy.settings import APPEARANCES, AUTO, HierarchySettings, is_large, require_composed
 from lapgs_plugin.options import check_values, option, option_name, options_of, require_positive
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.runs.options import PANEL as RUN
 from lapgs_plugin.runs.options import MeasuringOptions
 from lapgs_plugin.training.strategies import (
@@ -40,10 +40,6 @@ LAST = "last"
 """Choice of --keep: the state after the last iteration."""
 BEST = "best"
 """Choice of --keep: the state whose held-out views were best."""
-ON = "on"
-"""Choice of --exposure: learn colour transforms of the photos."""
-OFF = "off"
-"""Choice of --exposure: learn none."""
 
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
@@ -218,15 +214,17 @@ class TrainSettings(HierarchySettings):
         "with --strategy mcmc, else 0.",
         panel=SCHEDULE,
     )
-    exposure: str = option(
+    appearance: str = option(
         AUTO,
-        "Learn an affine colour transform for each training photo, against changes of exposure and white balance: "
-        "on, off, or auto, which measures whether there are any. Renders show the mean exposure.",
+        "Learn how each training photo differs from the scene. affine: a colour transform, against changes of exposure "
+        "and white balance. bilateral: a grid of them over the image and brightness, also against vignetting and local "
+        "tone mapping. auto: affine if the photos' exposure is measured to differ, else none. Renders show the mean "
+        "exposure.",
         panel=SCHEDULE,
-        choices=(AUTO, ON, OFF),
+        choices=(AUTO, NONE, *APPEARANCES),
     )
     depth: str = option(
-        "none",
+        NONE,
         "Supervise depth in all levels but residuals: a folder of depth maps named as the photos (16-bit PNG, EXR, "
         "NPY), points (those of COLMAP that a photo sees), auto (depth_file_path of transforms.json, the scene's "
         "folder depth/ or that of an export, or none of them), or none.",
@@ -270,7 +268,7 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"sh_every {self.sh_every}: expected at least 1")
         self._check_base()
         self._check_unused()
-        self._check_exposure()
+        require_composed(self.appearance, self.supervision)
         _ = self.asked_views
         if self.sh_rate_factor is not None:
             require_positive("--sh-rate-factor", self.sh_rate_factor, "factor")
@@ -326,14 +324,6 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(
                 f"--base-sh-degree {degree} with --inherit full: a level that inherits all coefficients has as "
                 "many; inherit geometry or xyz"
-            )
-
-    def _check_exposure(self) -> None:
-        """Refuse transforms of an image that is not compared with the photo."""
-        if self.exposure == ON and not SUPERVISIONS[self.supervision].composes:
-            raise UserInputError(
-                f"--exposure on with --supervision {self.supervision}: that compares residuals, which have no "
-                "exposure; leave one out"
             )
 
     def _check_unused(self) -> None:
@@ -467,8 +457,8 @@ class TrainSettings(HierarchySettings):
                 "views_per_step": "1",
                 "sh_rate_factor": 1.0,
                 "decay": 1.0,
-                "exposure": OFF,
-                "depth": "none",
+                "appearance": NONE,
+                "depth": NONE,
                 "refine_poses": False,
             },
             "dropout": 0.0,

@@ -23,12 +23,13 @@ from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.runs.image_store import AHEAD
+from lapgs_plugin.stages.appearance import ViewAppearance
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
+from lapgs_plugin.stages.view_transforms import ViewTransforms
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
 from lapgs_plugin.training.depth import StageDepth, depth_weight
 from lapgs_plugin.training.dropout import thinned
-from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
@@ -40,7 +41,6 @@ from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.stage_start import joint_fields
 from lapgs_plugin.training.time_budget import StageBudget
-from lapgs_plugin.training.view_transforms import ViewTransforms
 from lapgs_plugin.training.views import LevelView, level_views
 
 FINITE_CHECK_EVERY = 100
@@ -97,7 +97,7 @@ class StageRun:
         images: photos of the training views, and their predictions by the coarser levels.
         model: the field, edited in place.
         densifier: density control with its statistics.
-        exposures: colour transforms of the training views; None without compensation of exposure.
+        appearance: transforms of the training views' images; None with `--appearance none`.
         poses: corrections of the training views' poses; None without refinement.
         depth: supervises it; None without depth and in residuals.
         record: measures it.
@@ -119,7 +119,7 @@ class StageRun:
     hooks: HookDispatcher
     model: TrainableField
     densifier: DensityControl
-    exposures: ViewExposures | None
+    appearance: ViewAppearance | None
     poses: ViewPoses | None
     depth: StageDepth | None
     record: StageRecord
@@ -155,7 +155,7 @@ class StageRun:
             breakdown=self.record.breakdown,
             hooks=self.hooks,
             rasterizer=self._rasterizer,
-            exposures=self.exposures,
+            appearance=self.appearance,
             ssim_weight=settings.ssim_weight,
         )
         self._scoring = FieldScoring(
@@ -435,7 +435,7 @@ class StageRun:
     @property
     def transforms(self) -> dict[str, ViewTransforms | None]:
         """Learned transforms of the training views, by their names in checkpoints."""
-        return {"exposure": self.exposures, "poses": self.poses}
+        return {"appearance": self.appearance, "poses": self.poses}
 
     def _launch(self, planned: _Planned, then: _Planned | None) -> _Launch:
         """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""

@@ -11,7 +11,9 @@ from torch import Tensor
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.hierarchy.inheritance import field_from_points
 from lapgs_plugin.hierarchy.plan import Stage, continues_field
-from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.hierarchy.settings import AFFINE, AUTO, BILATERAL
+from lapgs_plugin.ops.mixed_sizes import largest_size
+from lapgs_plugin.registry import NONE
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import refined_views
 from lapgs_plugin.runs.image_store import eight_bit_levels
@@ -20,16 +22,15 @@ from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View, with_pixels
+from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, from_gains, identities
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.depth import StageDepth
-from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.prepared_run import PreparedRun
-from lapgs_plugin.training.settings import OFF
 from lapgs_plugin.training.views import level_views
 
 
@@ -134,31 +135,37 @@ def stage_depth(run: PreparedRun, stage: Stage) -> StageDepth | None:
     return StageDepth.create(run.depth, cameras, run.rasterizer, run.device)
 
 
-def first_exposures(
+def first_appearance(
     run: PreparedRun, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead, monitor: Monitor
-) -> ViewExposures | None:
-    """Return the colour transforms that a stage starts with; None if the run does not compensate exposure."""
-    names, levels = [view.name for view in run.scene.train], run.archive.available_levels
+) -> ViewAppearance | None:
+    """Return the transforms of the training views' images that a stage starts with; None without."""
+    names, levels, choice = (
+        [view.name for view in run.scene.train],
+        run.archive.available_levels,
+        run.settings.appearance,
+    )
+    if choice == NONE or not run.supervision.composes:
+        return None
+    kind = KINDS[AFFINE if choice == AUTO else choice]
+    size = largest_size([view.camera.size for view in run.scene.train])
     start: Tensor | None
     if levels:
-        archived = run.archive.exposure(levels[-1])
-        start = None if archived is None else start_from(archived, names)
+        start = kind.read(run.archive, levels[-1], names)
     elif checkpoint is not None:  # `StageRun.restore` has the values
-        start = None if checkpoint.get("exposure") is None else identities(len(names))
+        start = None if checkpoint.get("appearance") is None else kind.uniform(identities(len(names)), size)
     else:
-        with overhead.timed("exposure"):
-            start = _measured_exposures(run, monitor)
+        with overhead.timed("appearance"):
+            colors = _measured_colors(run, monitor)
+        start = None if colors is None else kind.uniform(colors, size)
     if start is None:
         return None
     done = run.plan.iterations_before(stage.level)
-    return ViewExposures.create(names, start, run.device, done, run.plan.iterations)
+    return kind.create(names, start, run.device, done, run.plan.iterations)
 
 
-def _measured_exposures(run: PreparedRun, monitor: Monitor) -> Tensor | None:
-    """Return the colour transforms (v, 3, 4) that a run starts with, as --exposure says and the photos differ."""
-    choice = run.settings.exposure
-    if choice == OFF or not run.supervision.composes:
-        return None
+def _measured_colors(run: PreparedRun, monitor: Monitor) -> Tensor | None:
+    """Return the photos' colour transforms (v, 3, 4) by their measured exposure; None if none are to be learned."""
+    choice = run.settings.appearance
 
     def look_up(points: Tensor) -> list[tuple[Tensor, Tensor]]:
         own = {view.name: colors_at(view, points) for view in run.owned(run.scene.train)}
@@ -169,9 +176,10 @@ def _measured_exposures(run: PreparedRun, monitor: Monitor) -> Tensor | None:
     spread, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
     if choice == AUTO and not differ:
         return None
+    learned = "a bilateral grid" if choice == BILATERAL else "a colour transform"
     monitor.say(
-        f"exposure differs by {spread}: each photo gets a colour transform; --exposure off trains without"
+        f"exposure differs by {spread}: each photo gets {learned}; --appearance none trains without"
         if differ
-        else f"exposure differs by {spread}, hardly at all; each photo gets a colour transform all the same"
+        else f"exposure differs by {spread}, hardly at all; each photo gets {learned} all the same"
     )
     return from_gains(measured.gains) if differ else identities(len(run.scene.train))

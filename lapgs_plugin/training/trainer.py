@@ -39,7 +39,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.stage import StageRun
 from lapgs_plugin.training.stage_start import (
-    first_exposures,
+    first_appearance,
     first_model,
     first_poses,
     photos_of,
@@ -309,7 +309,7 @@ class Trainer:
             hooks=self._hooks,
             model=model,
             densifier=prepared.density_control(stage, schedule),
-            exposures=first_exposures(prepared, stage, checkpoint, record.overhead, self.monitor),
+            appearance=first_appearance(prepared, stage, checkpoint, record.overhead, self.monitor),
             poses=poses,
             depth=stage_depth(prepared, stage),
             record=record,
@@ -334,14 +334,15 @@ class Trainer:
         settings, archive = self.prepared.settings, self.prepared.archive
         record, joint = run.record.of_level(len(field)), run.joint
         along = {} if joint is None else joint.fields
-        exposure = None if run.exposures is None else run.exposures.archived()
+        exposure = None if run.appearance is None else run.appearance.archived()
+        grids = None if run.appearance is None else run.appearance.archived_grids()
         poses = None if run.poses is None else run.poses.archived()
         if extends:
             extended = {"iterations": settings.iterations, "extended": settings.extended}
-            archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, extended)
+            archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, grids, extended)
         else:
             inherited = stage.level > 0 and settings.inherit_mode == "full"
             moments = run.model.optimizer_moments() if inherited else None
-            archive.finish_level(record, field, moments, along or None, exposure, poses)
+            archive.finish_level(record, field, moments, along or None, exposure, poses, grids)
         for line in run.record.weak_lines():
             self.monitor.say(line)

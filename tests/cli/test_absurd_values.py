@@ -70,6 +70,10 @@ def test_one_line_and_nothing_written(
         ("nothing", "lapgs: no such command 'nothing'; see `lapgs --help`"),
         ("trian", "lapgs: no such command 'trian'. Did you mean 'train'? See `lapgs --help`"),
         ("--nothing", "lapgs: no such option: --nothing; see `lapgs --help`"),
+        (
+            "train s -o r --exposure on",
+            "lapgs: no such option: --exposure; give --appearance (none, affine or bilateral; before: off, on)",
+        ),
         ("patch nothing", "lapgs: no such command 'nothing'; see `lapgs patch --help`"),
     ],
 )

@@ -63,7 +63,8 @@ def test_everything_of_a_run_by_relative_paths(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("data").symlink_to(scene.parent, target_is_directory=True)
-    words = ("train", "data/sample", "-o", "runs/a", "--eval", "--exposure", "on", "--refine-poses", "--sh-degree", "0")
+    words = ("train", "data/sample", "-o", "runs/a", "--eval", "--appearance", "affine", "--refine-poses")
+    words = (*words, "--sh-degree", "0")
     commands = (
         (*words, "--iterations", "12"),
         (*words, "--resume", "--iterations", "16"),
@@ -213,7 +214,7 @@ def test_a_scene_in_small_units_is_trained_resumed_measured_and_exported(
     model = pycolmap.Reconstruction(str(small / "sparse/0"))
     model.transform(pycolmap.Sim3d(1e-3, pycolmap.Rotation3d(), np.zeros(3)))
     model.write_binary(str(small / "sparse/0"))
-    options = ("--eval", "--levels", "1", "--exposure", "off")
+    options = ("--eval", "--levels", "1", "--appearance", "none")
     assert lapgs("train", small, "-o", run, *SHORT, *options).returncode == 0
     unit = json.loads((run / MANIFEST).read_text())["scene"]["unit"]
     assert unit == load_scene(small, progress=False).unit < 1e-2

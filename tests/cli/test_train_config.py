@@ -124,6 +124,7 @@ def test_auto_continues_with_the_strategy_of_the_run(scene: Path, tmp_path: Path
     [
         ("iteratons = 5", r"iteratons is not an option of .*; did you mean iterations\?"),
         ("views_per_stp = 2", r"views_per_stp is not an option of .*; did you mean views-per-step\?"),
+        ('exposure = "off"', r"exposure is no option any more; give --appearance \(none, affine or bilateral"),
         ("foo = 5", "foo is not an option of .*; .* --help lists them"),
         ('out = "elsewhere"', "out is not an option of .*; .* --help lists them"),
         ("levels = [2]", r"levels is \[2\], expected a string, a number, true or false"),

@@ -306,6 +306,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], str]] = {
     "resume nested": (("--hierarchy", "nested", "--resume"), (), "--resume: Runner.train"),
     "supervision": (("--supervision", "online_residual"), (), "--supervision online_residual has no effect"),
     "prune": (("--prune", 0.01), (), "--prune 0.01 has no effect"),
+    "appearance": (("--appearance", "affine"), (), "--appearance affine has no effect"),
     "inherit": (("--inherit", "full"), (), "--inherit full"),
     "masks": (("--masks", "masks"), (), "--masks masks"),
     "breakdown": (("--breakdown",), (), "--breakdown"),

@@ -42,8 +42,8 @@ SETTINGS = TrainSettings(
 )
 KINDS = {
     "laplacian": SETTINGS,
-    "nested": replace(SETTINGS, hierarchy="nested", joint=None),
-    "one field": replace(SETTINGS, levels=1, joint=None, exposure="on", keep="best"),
+    "nested": replace(SETTINGS, hierarchy="nested", joint=None, appearance="bilateral"),
+    "one field": replace(SETTINGS, levels=1, joint=None, appearance="affine", keep="best"),
 }
 
 
@@ -98,6 +98,8 @@ def test_a_finished_run_is_extended(finished: Path, scene: Scene, tmp_path: Path
     assert contents(finished)[-1] != contents(path)[-1]
     # It rose by 0.9 dB at least.
     assert quality(path, scene) >= quality(finished, scene)
+    for grids in filter(None, [old.grids(0)]):
+        assert any((grids[name] != grid).any() for name, grid in (new.grids(0) or {}).items())
     history = new.history()
     assert history[: len(old.history())] == old.history()
     assert (history[-1]["level"], history[-1]["iteration"]) == (0, after.iterations)

@@ -16,7 +16,7 @@ from lapgs_plugin.training.settings import TrainSettings
 from tests.training_runs import StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
-TIMED = TrainSettings(iterations=400, time="6s", sh_degree=1, exposure="on", split="1/2,1/2", joint=0.25)
+TIMED = TrainSettings(iterations=400, time="6s", sh_degree=1, appearance="affine", split="1/2,1/2", joint=0.25)
 """Of `Ticks` that is 600 iterations; 400 are what was expected."""
 
 

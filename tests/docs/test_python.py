@@ -107,7 +107,7 @@ def test_the_trainer_takes_a_hook_with_an_argument(
     shutil.copytree(sample, "data/mine")
     program = executed("train_with_a_hook.py")
     for weight in (0.0, 9.0):
-        program["main"](f"runs/{weight:g}", weight, iterations=40, sh_degree=0, exposure="off")
+        program["main"](f"runs/{weight:g}", weight, iterations=40, sh_degree=0, appearance="none")
     without, filled = (lapgs.RunArchive.open(f"runs/{weight}") for weight in (0, 9))
     assert settings_from_manifest(filled.manifest).iterations == 40
     camera = lapgs.level_camera(lapgs.run_scene(filled).train[0].camera, 1)

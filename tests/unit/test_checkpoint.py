@@ -93,7 +93,7 @@ def cut(saved: Saved, *keys: Any) -> Saved:
 
 STATE = ("state",)
 COLOURS: Saved = {"transforms": torch.zeros(2, 3, 4), "gradient": None, "moments": {}}
-BEST: Saved = {"psnr": 20.0, "iteration": 1, "joint": None, "exposure": COLOURS}
+BEST: Saved = {"psnr": 20.0, "iteration": 1, "joint": None, "appearance": COLOURS}
 DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     "a list": (lambda saved: [], "holds a list, expected a dictionary"),
     "empty": (lambda saved: {}, "holds level None and a state that is a NoneType"),
@@ -150,7 +150,7 @@ DAMAGE: dict[str, tuple[Callable[[Saved], Any], str]] = {
     "unsigned": (lambda saved: put(saved, False, "state", "model", "signed"), "model is no residual of SH degree 1"),
     "colours of the best state": (
         lambda saved: put(saved, {**BEST, "model": saved["state"]["model"]}, "state", "best"),
-        "best.exposure is not the state of transforms for 0 views",
+        "best.appearance is not the state of transforms for 0 views",
     ),
     "densifier": (lambda saved: put(saved, {}, "state", "densifier"), "densifier is not the state"),
     "densifier cut": (

@@ -339,7 +339,7 @@ def test_a_plane_at_known_depth_is_found(tmp_path: Path, hierarchy: str, levels:
     scene = wall_scene((0.0,) * 3)
     points = 3 * torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) - 1.5
     scene = replace(scene, points=points, colors=torch.full_like(points, 0.5))
-    settings = TrainSettings(iterations=1200, hierarchy=hierarchy, levels=levels, exposure="off")
+    settings = TrainSettings(iterations=1200, hierarchy=hierarchy, levels=levels, appearance="none")
     depth, errors = wall_depth(scene), []
     for name, given in (("without", None), ("with", depth)):
         archive = RunArchive.open(trained(tmp_path / name, scene, settings, given))

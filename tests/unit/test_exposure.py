@@ -25,7 +25,7 @@ from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.exposure import measure_exposure
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities
+from lapgs_plugin.stages.appearance import DIFFERENT, ViewColors, from_gains, identities
 from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
 from tests.training_runs import StopAt, resume, train
@@ -89,7 +89,7 @@ def wall_scene(stops: tuple[float, ...]) -> Scene:
 def test_transforms_learn_the_gains_of_photos_and_their_mean_stays_the_identity() -> None:
     gains = torch.tensor([[0.8, 1.0, 1.3], [1.0, 1.3, 0.9], [1.2, 0.7, 0.8]])
     names, image = ["a", "b", "c"], random_image(0)
-    exposures = ViewExposures.create(names, identities(3), torch.device("cpu"), 0, 600)
+    exposures = ViewColors.create(names, identities(3), torch.device("cpu"), 0, 600)
     start = exposures.transforms.detach().clone()
     for iteration in range(1, 601):
         view = (iteration - 1) % 3
@@ -104,7 +104,7 @@ def test_transforms_learn_the_gains_of_photos_and_their_mean_stays_the_identity(
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
 def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
     scene = wall_scene(STOPS)
-    settings = TrainSettings(iterations=60, hierarchy=hierarchy, exposure="on", sh_degree=0)
+    settings = TrainSettings(iterations=60, hierarchy=hierarchy, appearance="affine", sh_degree=0)
     whole = train(tmp_path / "whole", scene, settings)
     archived = whole.exposure(0)
     assert archived is not None
@@ -125,11 +125,13 @@ def test_run_learns_the_exposure_of_its_photos_and_resumes_to_the_same_bits(tmp_
 
 def test_compensation_beats_none_where_exposure_changes_and_is_left_out_where_it_does_not(tmp_path: Path) -> None:
     psnrs = {}
-    for choice in ("on", "off"):
-        archive = train(tmp_path / choice, wall_scene(STOPS), TrainSettings(iterations=200, exposure=choice, levels=1))
-        assert (archive.exposure(0) is None) == (choice == "off")
+    for choice in ("affine", "none"):
+        archive = train(
+            tmp_path / choice, wall_scene(STOPS), TrainSettings(iterations=200, appearance=choice, levels=1)
+        )
+        assert (archive.exposure(0) is None) == (choice == "none")
         psnrs[choice] = archive.history()[-1]["loss"]
-    assert psnrs["on"] < 0.8 * psnrs["off"]  # worst seen 0.6 of it
+    assert psnrs["affine"] < 0.8 * psnrs["none"]  # worst seen 0.6 of it
     archive = train(tmp_path / "auto", wall_scene((0.0,) * 6), TrainSettings(iterations=12))
     assert archive.exposure(0) is None
     archive = train(tmp_path / "changing", wall_scene(STOPS), TrainSettings(iterations=12))
@@ -137,7 +139,7 @@ def test_compensation_beats_none_where_exposure_changes_and_is_left_out_where_it
 
 
 def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
-    settings = TrainSettings(iterations=12, exposure="on", levels=1)
+    settings = TrainSettings(iterations=12, appearance="affine", levels=1)
     archive = train(tmp_path / "run", ring_scene(), settings)
     path = archive.path("level_0", EXPOSURE)
     path.write_text(json.dumps({"view_1.png": [[1.0, 0.0]]}))
@@ -148,9 +150,12 @@ def test_damaged_transforms_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"exposure": "yes"}, "--exposure yes: expected auto, on or off"),
-        ({"exposure": "on", "supervision": "gt_laplacian"}, "--exposure on with --supervision gt_laplacian"),
-        ({"exposure": "on", "protocol": "paper"}, "--exposure on with --protocol paper"),
+        ({"appearance": "on"}, "--appearance on: expected auto, none, affine or bilateral"),
+        (
+            {"appearance": "affine", "supervision": "gt_laplacian"},
+            "--appearance affine with --supervision gt_laplacian",
+        ),
+        ({"appearance": "bilateral", "protocol": "paper"}, "--appearance bilateral with --protocol paper"),
     ],
 )
 def test_contradicting_choices_are_refused(given: dict[str, str], message: str) -> None:
@@ -209,7 +214,7 @@ def test_gradients_reach_the_field_through_the_transform() -> None:
 
 def test_several_views_are_transformed_as_each_is() -> None:
     names, images = ["a", "b", "c"], torch.stack([random_image(seed) for seed in (0, 1)])
-    exposures = ViewExposures.create(names, from_gains(0.3 * random_image(2)[0, :3, :3]), torch.device("cpu"), 0, 1)
+    exposures = ViewColors.create(names, from_gains(0.3 * random_image(2)[0, :3, :3]), torch.device("cpu"), 0, 1)
     together = exposures.apply(["c", "a"], images)
     (by_all,) = torch.autograd.grad(together.square().mean(), exposures.transforms)
     alone = [exposures.apply([name], image) for name, image in zip(["c", "a"], images, strict=True)]

@@ -167,7 +167,7 @@ def test_another_branch_and_other_numbers_are_refused() -> None:
 def test_a_run_of_residuals_learns_as_on_the_cpu_rasterizer(strategy: str, tmp_path: Path) -> None:
     options = {"mcmc": Mcmc(), "3dgs": Gradients()}[strategy]
     settings = TrainSettings(
-        iterations=30, levels=2, hierarchy="laplacian", sh_degree=1, exposure="off",
+        iterations=30, levels=2, hierarchy="laplacian", sh_degree=1, appearance="none",
         densification=Densification(strategy=strategy, options=options, every=10),
     )  # fmt: skip
     scene, outcomes = ring_scene(train=5, test=1), []

@@ -297,7 +297,7 @@ def test_removal_leaves_the_weight_of_the_opacities_that_remain(signed: bool) ->
 def test_a_residual_under_pressure_keeps_gaussians(tmp_path: Path) -> None:
     """A mean over those that are left would kill nearly all, with four times the default weight."""
     density = Densification(MCMC, start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=0.04))
-    settings = TrainSettings(iterations=300, levels=2, sh_degree=0, exposure="off", densification=density)
+    settings = TrainSettings(iterations=300, levels=2, sh_degree=0, appearance="none", densification=density)
     residual = train(tmp_path / "run", ring_scene(), settings).manifest.records[-1]
     assert residual.start_gaussians == 600
     assert residual.num_gaussians > 30  # 81 seen, 7 before
@@ -322,7 +322,7 @@ def test_a_residual_of_a_scene_with_detail_keeps_gaussians(weight: float | None,
     points = field.means[::3]
     scene = replace(ring_scene(), train=tuple(views), test=(), points=points, colors=torch.full((len(points), 3), 0.5))
     density = Densification(MCMC, start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=weight))
-    settings = TrainSettings(iterations=400, levels=2, sh_degree=0, exposure="off", densification=density)
+    settings = TrainSettings(iterations=400, levels=2, sh_degree=0, appearance="none", densification=density)
     residual = train(tmp_path / "run", scene, settings).manifest.records[-1]
     assert residual.start_gaussians == 600
     assert residual.num_gaussians >= least

@@ -200,7 +200,7 @@ def test_rendered_together_or_one_by_one_a_run_is_the_same(
         sh_degree=0,
         views_per_step="7",
         joint=0.4,
-        exposure="on" if masked else "off",
+        appearance="affine" if masked else "none",
         densification=Densification(start=3, until=until, every=14),
     )
     mixing, lines = Mixing(), Said()

@@ -22,7 +22,7 @@ from lapgs_plugin.training.settings import Densification, TrainingControl, Train
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_runs import StopAt, plys
 
-SHORT = TrainSettings(iterations=20, levels=1, sh_degree=0, exposure="off")
+SHORT = TrainSettings(iterations=20, levels=1, sh_degree=0, appearance="none")
 
 
 @pytest.fixture(scope="module")

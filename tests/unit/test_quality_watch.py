@@ -13,8 +13,8 @@ from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.stages.appearance import ViewColors
 from lapgs_plugin.training.evaluation import StageEvaluation, ViewPsnr
-from lapgs_plugin.training.exposure import ViewExposures
 from lapgs_plugin.training.planning import make_plan
 from lapgs_plugin.training.quality import (
     FALL,
@@ -84,26 +84,29 @@ def measured(psnr: float) -> ViewPsnr:
 def test_a_run_that_gets_worse_says_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = iter([30.0 - step for step in range(100)])
     monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: measured(next(values)))
-    scene, settings = ring_scene(train=5, test=1), TrainSettings(iterations=60, levels=1, sh_degree=0, exposure="off")
+    scene, settings = (
+        ring_scene(train=5, test=1),
+        TrainSettings(iterations=60, levels=1, sh_degree=0, appearance="none"),
+    )
     monitor = Said()
     train(tmp_path / "run", scene, settings, monitor=monitor)
     (line,) = (said for said in monitor.lines if said != "density control: --strategy 3dgs")
     assert line.startswith("level 0, iteration ")
     assert "held-out PSNR fell to 2" in line
-    assert "--exposure on" in line
+    assert "--appearance affine" in line
 
 
-def test_exposures_are_read_for_measurements_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colors_are_read_for_measurements_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Reading them waits for a GPU, and between steps no clock runs.
     reads = []
-    archived = ViewExposures.archived
+    archived = ViewColors.archived
 
-    def read(exposures: ViewExposures) -> Any:
+    def read(colors: ViewColors) -> Any:
         reads.append(None)
-        return archived(exposures)
+        return archived(colors)
 
-    monkeypatch.setattr(ViewExposures, "archived", read)
-    settings = TrainSettings(iterations=200, levels=1, sh_degree=0, exposure="on", keep="last")
+    monkeypatch.setattr(ViewColors, "archived", read)
+    settings = TrainSettings(iterations=200, levels=1, sh_degree=0, appearance="affine", keep="last")
     train(tmp_path / "run", ring_scene(train=5, test=1), settings)
     assert 1 <= len(reads) <= 10  # eight measurements at most, and the archive
 
@@ -115,7 +118,7 @@ def test_keep_best_keeps_the_last_state_unless_another_one_is_visibly_better(
     values = (value for value in samples for _ in range(2))
     monkeypatch.setattr(StageEvaluation, "_psnr", lambda *_: measured(next(values)))
     scene = ring_scene(train=12, test=0)
-    settings = TrainSettings(iterations=40, levels=1, sh_degree=0, exposure="off", keep="best")
+    settings = TrainSettings(iterations=40, levels=1, sh_degree=0, appearance="none", keep="best")
     monitor = Said()
     train(tmp_path / "run", scene, settings, monitor=monitor)
     assert next(values, None) is None
@@ -135,7 +138,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
 ) -> None:
     """By invented measurements the base is best at its fourth sample, the residual, in joint training, at its ninth."""
     scene = ring_scene(train=12, test=0)
-    settings = TrainSettings(iterations=80, sh_degree=0, keep="best", exposure="on", joint=0.5)
+    settings = TrainSettings(iterations=80, sh_degree=0, keep="best", appearance="affine", joint=0.5)
     aside = [view.name for view in set_aside(scene.train)]
     assert len(aside) == 2
     fields: dict[tuple[int, int], Tensor] = {}
@@ -144,7 +147,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     def invented(evaluation: StageEvaluation, view: View, exposure: Tensor | None) -> ViewPsnr:
         run = evaluation.run
         assert view.name in aside
-        assert run.exposures is not None
+        assert run.appearance is not None
         moment = run.stage.level, run.counts.iteration
         fields[moment] = run.model.field.means.detach().clone()
         if run.joint is not None:

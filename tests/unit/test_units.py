@@ -70,7 +70,7 @@ def write_ring(folder: Path, scale: float = 1.0, points: np.ndarray | None = Non
 
 
 def settings_of(**options: Any) -> TrainSettings:
-    return TrainSettings(**{"iterations": 30, "sh_degree": 1, "exposure": "off", **options})
+    return TrainSettings(**{"iterations": 30, "sh_degree": 1, "appearance": "none", **options})
 
 
 def train(folder: Path, scene: Scene, monitor: Monitor | None = None, **options: Any) -> tuple[RunArchive, list[str]]:

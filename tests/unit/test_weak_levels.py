@@ -95,7 +95,7 @@ def test_gains_are_those_of_the_last_measurement() -> None:
 def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any], tmp_path: Path) -> None:
     """Of the base as joint training left it, and of the state that `--keep best` chose."""
     scene = ring_scene(train=12, test=4)
-    settings = TrainSettings(iterations=60, levels=2, sh_degree=0, exposure="off", **changed)
+    settings = TrainSettings(iterations=60, levels=2, sh_degree=0, appearance="none", **changed)
     archive = train(tmp_path / "run", scene, settings)
     gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
@@ -103,7 +103,7 @@ def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any]
 
 def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Path) -> None:
     scene = ring_scene(train=5, test=4)
-    settings = TrainSettings(iterations=40, levels=2, sh_degree=0, exposure="off")
+    settings = TrainSettings(iterations=40, levels=2, sh_degree=0, appearance="none")
     archive = train(tmp_path / "run", scene, settings, test_every=15)
     gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
@@ -111,7 +111,7 @@ def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Pat
 
 def test_a_residual_that_dies_is_a_line_of_its_training(tmp_path: Path) -> None:
     density = Densification("mcmc", start=1, every=10, options=Mcmc(cap_max=600, opacity_regularization=1.0))
-    settings = TrainSettings(iterations=300, levels=2, sh_degree=0, exposure="off", densification=density)
+    settings = TrainSettings(iterations=300, levels=2, sh_degree=0, appearance="none", densification=density)
     said = Said()
     residual = train(tmp_path / "run", ring_scene(), settings, monitor=said).manifest.records[-1]
     assert residual.num_gaussians < 60
@@ -124,7 +124,7 @@ def test_a_residual_that_dies_is_a_line_of_its_training(tmp_path: Path) -> None:
 def test_a_residual_that_learns_nothing_is_a_line_of_its_training(tmp_path: Path) -> None:
     """A colour rate of almost 0 leaves it transparent; all of its Gaussians stay."""
     settings = TrainSettings(
-        iterations=1000, levels=2, split="1/2,1/2", sh_degree=0, exposure="off", joint=0.0, residual_color_rate=1e-6
+        iterations=1000, levels=2, split="1/2,1/2", sh_degree=0, appearance="none", joint=0.0, residual_color_rate=1e-6
     )
     said = Said()
     train(tmp_path / "run", ring_scene(train=5, test=4), settings, monitor=said)

@@ -24,7 +24,7 @@ from lapgs_plugin.hierarchy.supervision import RECONSTRUCTED
 from lapgs_plugin.options import option_name
 from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
-from lapgs_plugin.registry import HOOKS, chosen_entries
+from lapgs_plugin.registry import HOOKS, NONE, chosen_entries
 from lapgs_plugin.runner.dry_run import full_gpu_told
 from lapgs_plugin.runner.manifest import require_same_run
 from lapgs_plugin.runner.rasterizer_choice import CHOICE, Decision, recorded_choice
@@ -219,7 +219,10 @@ def refuse_settings(request: SplatRequest) -> None:
         UserInputError: there is one.
     """
     settings, kind = request.settings, "scripts around gsplat's rasterization()"
-    idle = {"supervision": RECONSTRUCTED, "prune": 0.0, "prune_by_size": True, "fused_ssim": True, "run_ahead": True}
+    idle = {
+        **{"supervision": RECONSTRUCTED, "prune": 0.0, "appearance": NONE},
+        **{"prune_by_size": True, "fused_ssim": True, "run_ahead": True},
+    }
     declared = {setting.name: setting for setting in fields(settings)}
     for name, value in idle.items():
         if (chosen := getattr(settings, name)) != value:

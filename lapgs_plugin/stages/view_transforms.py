@@ -8,11 +8,23 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
-
-from lapgs_plugin.training.ranks.group import ALONE, Ranks
+from torch import Tensor
 
 BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
+
+
+class OneProcess:
+    """Sum gradients over the processes that train the views: this one alone."""
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process reads and writes the run folder."""
+        return True
+
+    def sum_of(self, tensor: Tensor | None, like: Tensor) -> Tensor | None:
+        """Return the sum of a tensor over all processes, which is kept; None, on some of several, counts as zeros."""
+        return tensor
 
 
 @dataclass
@@ -33,18 +45,22 @@ class ViewTransforms(ABC):
 
     STARTS_AT: ClassVar[float] = 0.0
     """Share of the run's iterations before the first step."""
+    WARM_UP: ClassVar[float] = 0.0
+    """Share of the run's iterations in which the step size grows linearly from 0."""
+    EPSILON: ClassVar[float] = 1e-8
+    """Of Adam."""
 
     names: Sequence[str]
     transforms: torch.nn.Parameter  # (v, ...)
     done: int
     total: int
-    ranks: Ranks = field(init=False, repr=False, default=ALONE)
+    ranks: OneProcess = field(init=False, repr=False, default=OneProcess())  # holds nothing
     _index: dict[str, int] = field(init=False, repr=False)
     _adam: torch.optim.Adam = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._index = {name: index for index, name in enumerate(self.names)}
-        self._adam = torch.optim.Adam([self.transforms], lr=self._rates[0], betas=BETAS)
+        self._adam = torch.optim.Adam([self.transforms], lr=self._rates[0], betas=BETAS, eps=self.EPSILON)
 
     @property
     @abstractmethod
@@ -69,7 +85,8 @@ class ViewTransforms(ABC):
             self.forget_gradients()
             return
         first, last = self._rates
-        self._adam.param_groups[0]["lr"] = first * (last / first) ** progress
+        warmth = progress / self.WARM_UP if progress < self.WARM_UP else 1.0
+        self._adam.param_groups[0]["lr"] = warmth * first * (last / first) ** progress
         self.transforms.grad = self.ranks.sum_of(self.transforms.grad, self.transforms)
         self._step()
 
