@@ -23,7 +23,7 @@ from lapgs_plugin.runs.gpu_busy import require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.depth import load_depth, resolve_depth
-from lapgs_plugin.scenes.masks import resolve_masks, share_inside
+from lapgs_plugin.scenes.masks import NONE, resolve_masks, resolve_sky, share_inside
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.scene import Scene, View, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
@@ -120,6 +120,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
         kind="",
         images=photos.images,
         masks=masks,
+        sky=resolve_sky(Path(request.scene), photos.sky),
     )
     if request.control.log is not None:
         require_tensorboard()
@@ -315,11 +316,17 @@ def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: Tr
 
 
 def _say_about_photos(run: PreparedRun, say: Say) -> None:
-    """Say the share of their pixels inside masks, and whether a CPU takes hours for so many."""
-    views = (*run.scene.train, *run.aside, *run.scene.test)
+    """Say the share of their pixels inside masks and in the sky, and whether a CPU takes hours for so many."""
+    views, scene = (*run.scene.train, *run.aside, *run.scene.test), run.archive.manifest.scene
+    if run.ranks.leads and scene.sky != NONE:
+        skies = [sky for view in views if (sky := view.sky) is not None]
+        say(
+            f"sky ({scene.sky}): {len(skies)} of {len(views)} photos have a mask, {share_inside(skies):.0%} of their "
+            "pixels are sky"
+        )
     if run.ranks.leads and any(view.masked for view in views):
-        share = share_inside(view.mask for view in views)
-        say(f"masks ({run.archive.manifest.scene.masks}): {share:.0%} of the pixels are trained on and measured")
+        share, masks = share_inside(view.mask for view in views), scene.masks if scene.sky == NONE else "and sky"
+        say(f"masks ({masks}): {share:.0%} of the pixels are trained on and measured")
     size = run.plan[0].image_size
     if run.device.type == "cpu" and (hint := long_on_a_cpu(size, run.settings.iterations)):
         say(hint)
