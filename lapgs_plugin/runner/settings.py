@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -67,6 +68,12 @@ class RunSettings(HierarchySettings):
         "folder masks/ if there is one).",
     )
 
+    depth: str = option(
+        "none",
+        "Supervise depth in all levels but residuals, beside the script's loss: a folder of depth maps named as the "
+        "photos, points (those of COLMAP that a photo sees), auto (the scene's folder depth/, if any), or none.",
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive("--sh-rate", self.sh_rate, "factor")
@@ -83,6 +90,11 @@ class RunSettings(HierarchySettings):
             return super().shares
         coarser = self.levels - 1
         return (Fraction(1, 3 * coarser),) * coarser + (Fraction(2, 3),)
+
+    @property
+    def paper_settings(self) -> Mapping[str, object]:
+        """See `HierarchySettings.paper_settings`."""
+        return {**super().paper_settings, "depth": "none"}
 
     @property
     def has_residuals(self) -> bool:

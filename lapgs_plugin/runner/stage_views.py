@@ -67,6 +67,9 @@ class StageViews:
             composed=frozenset(self.cameras if run.supervision.composes else test),
             on_image=run.context.hooks.on_image if run.context.hooks else None,
         )
+        if run.context.depth is not None and not stage.signed:
+            sizes = {key: self.size(key, stage.level) for key in self.train}
+            self.rendering.on_call = run.context.depth.in_stage(run.plan, stage, sizes)
 
     def load_images(self) -> None:
         """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""

@@ -15,8 +15,8 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.stages.geometry import StageGeometry
 from lapgs_plugin.stages.joint import RenderedPredictions
-from lapgs_plugin.training.geometry import StageGeometry
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses
 

@@ -23,12 +23,12 @@ from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.runs.image_store import AHEAD
+from lapgs_plugin.stages.geometry import StageGeometry, depth_weight
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.exposure import ViewExposures
-from lapgs_plugin.training.geometry import StageGeometry, depth_weight
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField

@@ -20,10 +20,10 @@ from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.stages.geometry import StageGeometry, depths_of, skies_of
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
-from lapgs_plugin.training.geometry import StageGeometry, depths_of, skies_of
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor

@@ -308,6 +308,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], str]] = {
     "prune": (("--prune", 0.01), (), "--prune 0.01 has no effect"),
     "inherit": (("--inherit", "full"), (), "--inherit full"),
     "masks": (("--masks", "masks"), (), "--masks masks"),
+    "depth": (("--depth", "points"), (), "--depth points"),
     "breakdown": (("--breakdown",), (), "--breakdown"),
     "record": (("--off", "--record"), (), "--record"),
     "patches": ((), ("--patch_size", 16), "--patch_size 16"),

@@ -37,7 +37,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.world import build_world
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.geometry import StageGeometry, depth_loss, depth_weight, mean_inverse_depth
+from lapgs_plugin.stages.geometry import StageGeometry, depth_loss, depth_weight, mean_inverse_depth
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.trainer import Trainer

@@ -27,7 +27,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.training.geometry import sky_loss
+from lapgs_plugin.stages.geometry import sky_loss
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.devices import DEVICES
 from tests.refusals import refuses

@@ -48,6 +48,14 @@ def mean_inverse_depth(blended: Tensor, opacity: Tensor) -> Tensor:
     return blended / opacity.clamp_min(LEAST_OPACITY)
 
 
+def resized_blend(blend: tuple[Tensor, Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return blended values and opacity, (h, w) each, at the size of a target that is not larger."""
+    if blend[0].shape == target.shape:
+        return blend
+    both = F.interpolate(torch.stack(blend)[None], tuple(target.shape), mode="area")[0]
+    return both[0], both[1]
+
+
 def depth_loss(inverse: Tensor, target: Tensor) -> Tensor:
     """Return the mean absolute difference of inverse depths (h, w) over the target's median, where that is no NaN.
 
