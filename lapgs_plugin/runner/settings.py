@@ -62,16 +62,16 @@ class RunSettings(HierarchySettings):
         names=("--dry-run/--no-dry-run",),
     )
 
-    masks: str = option(
-        "auto",
-        "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
-        "folder masks/ if there is one).",
-    )
-
     depth: str = option(
         "none",
         "Supervise depth in all levels but residuals, beside the script's loss: a folder of depth maps named as the "
         "photos, points (those of COLMAP that a photo sees), auto (the scene's folder depth/, if any), or none.",
+    )
+
+    masks: str = option(
+        "auto",
+        "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
+        "folder masks/ if there is one).",
     )
 
     def __post_init__(self) -> None:
