@@ -164,7 +164,15 @@ def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str 
         return extended_config(path, run.settings) if run.settings.extended else None
     photos = run.archive.manifest.scene
     length = run.settings.iterations if run.settings.time is None else None
-    write_config(path, context, masks=photos.masks, sky=photos.sky, iterations=length, depth=run.settings.depth)
+    write_config(
+        path,
+        context,
+        masks=photos.masks,
+        sky=photos.sky,
+        iterations=length,
+        depth=run.settings.depth,
+        normals=run.settings.normals,
+    )
     return None
 
 

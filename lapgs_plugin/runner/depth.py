@@ -28,7 +28,7 @@ from lapgs_plugin.runner.signed_calls import BACKGROUNDS
 from lapgs_plugin.runner.stage_rendering import Captured, OnCall
 from lapgs_plugin.scenes.depth import DepthTargets, depth_size, load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import NONE, stem_of
-from lapgs_plugin.scenes.scene import View, unread_scene
+from lapgs_plugin.scenes.scene import View, load_scene
 from lapgs_plugin.stages.geometry import EVERY, depth_loss, depth_weight, mean_inverse_depth, resized_blend
 
 logger = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ class CheckoutDepth:
             return None
         if own := getattr(dataset, "depths", ""):
             logger.warning("--depth %s and the script's --depths %s both supervise depth; leave one out", setting, own)
-        scene = unread_scene(source, folder)
+        scene = load_scene(source, images=folder, masks=NONE, progress=False, read=False)
         names = _names_by_key(keys, [view.name for view in scene.train])
         key_of = {name: key for key, name in names.items()}
         masked = partial(_with_mask, images)

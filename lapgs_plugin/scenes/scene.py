@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path, PurePath
 from shlex import quote
 from typing import Generic, TypeVar, cast
@@ -277,7 +276,7 @@ def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = Tru
     """
 
     def held(view: View) -> View:
-        return View(view.name, view.camera, view.image, view.mask)
+        return View(view.name, view.camera, view.image, view.mask, view.sky)
 
     return in_threads("Reading images", "images", held, views, most=MAX_WORKERS, progress=progress)
 
@@ -297,32 +296,6 @@ def load_cameras(
     source = _checked_source(Path(path), images, eval)
     train, test = ({f.name: _sized_camera(f, rule) for f in frames} for frames in (source.train, source.test))
     return train, test
-
-
-def unread_scene(path: Path, images: str) -> Scene:
-    """Return a scene at full size whose photos are read when they are used; no view is held out, none has a mask.
-
-    Args:
-        path, images: as `load_scene` takes them.
-
-    Raises:
-        SceneError: as `load_scene`.
-    """
-    source = _checked_source(path, images, evaluate=False)
-    views = [
-        View(frame.name, frame.camera.to(dtype=torch.float32), partial(read_image, frame.path))
-        for frame in source.train
-    ]
-    return Scene(
-        path=path,
-        kind=source.kind,
-        train=tuple(views),
-        test=(),
-        points=torch.from_numpy(source.points).float(),
-        colors=torch.from_numpy(source.colors).float().clamp(0.0, 1.0),
-        extent=_extent(path, source.train),
-        background=(0.0, 0.0, 0.0),
-    )
 
 
 def smallest_size(path: Path | str, *, resolution: str = "full", images: str = "images") -> tuple[int, int]:

@@ -1,7 +1,8 @@
-"""Supervise depth and sky of a field: maps beside the photos, or the points that they see; masks of the sky.
+"""Supervise depth, normals and sky of a field: maps beside the photos, or the points that they see; masks of the sky.
 
 Inverse depth is compared with that of the view, as in "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024).
-Residuals have no depth: in a hierarchy of them, the base alone is supervised.
+Normals are those of the field's depths, as in 2DGS (Huang et al. 2024). Residuals have no depth: in a hierarchy of
+them, the base alone is supervised.
 
 In the sky every field is trained to be transparent, by the cross-entropy of its opacity, as in "Street Gaussians" (Yan
 et al. 2024). A residual that is transparent adds no colour there.
@@ -32,6 +33,8 @@ LEAST_OPACITY = 0.01
 EVERY = 2
 """Iterations from one with these losses to the next, which count as often: their render costs as much as an image."""
 
+NORMAL_WEIGHT = 0.05
+"""Weight of the normal loss, that of 2DGS for normals of depths."""
 SKY_WEIGHT = 0.05
 """Weight of the sky loss, that of Street Gaussians."""
 LEAST_TRANSMITTANCE = 1e-5
@@ -75,18 +78,52 @@ def sky_loss(opacity: Tensor, sky: Tensor) -> Tensor:
     return torch.where(sky, -left.log(), 0.0).mean()
 
 
+def normals_of(inverse: Tensor, camera: Camera) -> Tensor:
+    """Return unit normals (3, h - 2, w - 2) towards the camera, in its axes, of inner pixels by inverse depths (h, w).
+
+    On a plane inverse depth is linear in the image, n . (x, y, 1) / d. So differences give its normal exactly.
+    """
+    across = (inverse[1:-1, 2:] - inverse[1:-1, :-2]) * (camera.fx / 2)
+    down = (inverse[2:, 1:-1] - inverse[:-2, 1:-1]) * (camera.fy / 2)
+    rows, columns = torch.meshgrid(
+        torch.arange(1, camera.height - 1).to(inverse), torch.arange(1, camera.width - 1).to(inverse), indexing="ij"
+    )
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    along = inverse[1:-1, 1:-1] - x * across - y * down
+    return -F.normalize(torch.stack([across, down, along]), dim=0)
+
+
+def normal_loss(inverse: Tensor, opacity: Tensor, target: Tensor, camera: Camera) -> Tensor:
+    """Return the mean of 1 - cos of the angles between a field's normals and a target, where that is no NaN.
+
+    Pixels count by their opacity, which gets no gradient.
+
+    Args:
+        inverse, opacity: (h, w).
+        target: (3, h, w) unit normals in the camera's axes.
+        camera: of this size.
+    """
+    wanted = target[:, 1:-1, 1:-1]
+    valid = ~wanted.isnan().any(0)
+    cosines = (normals_of(inverse, camera) * torch.where(valid, wanted, 0.0)).sum(0)
+    weight = valid * opacity.detach()[1:-1, 1:-1]
+    return (weight * (1.0 - cosines)).sum() / weight.sum().clamp_min(1.0)
+
+
 @dataclass
 class StageGeometry:
-    """Compute the losses of a stage's views by depth and sky, both of one render.
+    """Compute the losses of a stage's views by depth, normals and sky, all of one render.
 
     Attributes:
         rasterizer: renders inverse depths and opacities.
         depths: (h, w) inverse depth by view, in world units, on the device; NaN where there is none.
+        normals: (3, h, w) by view, on the device, in the camera's axes; NaN where there is none.
         skies: (h, w) bool by view, on the device, True in the sky.
     """
 
     rasterizer: Rasterizer
     depths: Mapping[str, Tensor]
+    normals: Mapping[str, Tensor]
     skies: Mapping[str, Tensor]
     _cameras: dict[str, tuple[Camera, Camera]] = field(default_factory=dict, repr=False)
 
@@ -110,16 +147,21 @@ class StageGeometry:
         losses = [
             self._of_view(name, self._camera(name, camera), gaussians, depth_weight)
             for iteration, name, camera in zip(iterations, names, cameras, strict=True)
-            if iteration % EVERY == 0 and (name in self.depths or name in self.skies)
+            if iteration % EVERY == 0 and any(name in those for those in (self.depths, self.normals, self.skies))
         ]
         return EVERY * torch.stack(losses).sum() / len(names) if losses else None
 
     def _of_view(self, name: str, camera: Camera, gaussians: GaussianField, depth_weight: float) -> Tensor:
-        """Return the weighted loss of a view that has depth or sky."""
+        """Return the weighted loss of a view that has depth, normals or sky."""
         blended, opacity = render_inverse_depths(self.rasterizer, gaussians, camera)
-        depth, sky = self.depths.get(name), self.skies.get(name)
-        losses = [] if depth is None else [depth_weight * depth_loss(mean_inverse_depth(blended, opacity), depth)]
-        return sum(losses, blended.new_zeros(())) if sky is None else sum(losses, SKY_WEIGHT * sky_loss(opacity, sky))
+        inverse, losses = mean_inverse_depth(blended, opacity), [blended.new_zeros(())]
+        if (depth := self.depths.get(name)) is not None:
+            losses.append(depth_weight * depth_loss(inverse, depth))
+        if (normals := self.normals.get(name)) is not None:
+            losses.append(NORMAL_WEIGHT * normal_loss(inverse, opacity, normals, camera))
+        if (sky := self.skies.get(name)) is not None:
+            losses.append(SKY_WEIGHT * sky_loss(opacity, sky))
+        return torch.stack(losses).sum()
 
     def _camera(self, name: str, camera: Camera) -> Camera:
         """Return a view's camera at the size of its target, the same object for the same camera."""
@@ -141,6 +183,18 @@ def depths_of(depth: DepthTargets, cameras: Mapping[str, Camera], device: torch.
     """
     names = [name for name in depth.names if name in cameras]
     return {name: depth.inverse(name, depth_size(cameras[name].size)).to(device) for name in names}
+
+
+def at_level(normals: Mapping[str, Tensor], cameras: Mapping[str, Camera], device: torch.device) -> dict[str, Tensor]:
+    """Return unit normals (3, h, w) of views at the size of a level, NaN where a pixel has none; as `depths_of`."""
+    sized = {}
+    for name, values in ((name, values) for name, values in normals.items() if name in cameras):
+        width, height = depth_size(cameras[name].size)
+        known = ~values.isnan().any(0, keepdim=True)
+        both = torch.cat([torch.where(known, values, 0.0), known.float()])[None]
+        *mean, share = F.interpolate(both, (height, width), mode="area")[0]
+        sized[name] = torch.where(share >= 0.5, F.normalize(torch.stack(mean), dim=0), torch.nan).to(device)
+    return sized
 
 
 def skies_of(views: Sequence[View], cameras: Mapping[str, Camera], device: torch.device) -> dict[str, Tensor]:

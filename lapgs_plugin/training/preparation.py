@@ -24,6 +24,7 @@ from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import NONE, resolve_masks, resolve_sky, share_inside
+from lapgs_plugin.scenes.normals import load_normals, resolve_normals
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.scene import Scene, View, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
@@ -110,7 +111,15 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     say = say if ranks.leads else _silent
     require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
     depth = resolve_depth(Path(request.scene), settings.depth)
-    request = replace(request, settings=replace(settings, depth=depth, ranks=max(settings.ranks, ranks.size)))
+    normals = resolve_normals(Path(request.scene), settings.normals)
+    if normals != NONE and depth == NONE:
+        raise UserInputError(
+            f"--normals {normals} without depth: normals alone leave surfaces where they are and make their distances "
+            "worse; add --depth with a folder of maps, or --depth points"
+        )
+    request = replace(
+        request, settings=replace(settings, depth=depth, normals=normals, ranks=max(settings.ranks, ranks.size))
+    )
     masks = resolve_masks(Path(request.scene), photos.masks)
     reference = SceneReference(
         path=str(request.scene),
@@ -157,12 +166,21 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
     depth = load_depth(scene, settings.depth, reference.images, say)
+    normals = load_normals(scene, settings.normals, say)
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     _require_same_run(ranks, scene, settings)
     with open_for(ranks, out, lambda kind: kind.create(out, manifest, request.overwrite)) as archive:
         run = PreparedRun.of(
-            scene, settings, archive, placed, request.control, began=request.began, depth=depth, ranks=ranks
+            scene,
+            settings,
+            archive,
+            placed,
+            request.control,
+            began=request.began,
+            depth=depth,
+            normals=normals,
+            ranks=ranks,
         )
         run = _ready(run)
         _say_about_photos(run, say)
@@ -228,9 +246,17 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
             scene = load_reference(here, lambda _, photos: _require_views(ranks, photos), **_reading(request, settings))
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
-            depth = load_depth(scene, settings.depth, manifest.scene.images, say)
             run = PreparedRun.of(
-                scene, settings, archive, placed, request.control, resumes=True, began=began, depth=depth, ranks=ranks
+                scene,
+                settings,
+                archive,
+                placed,
+                request.control,
+                resumes=True,
+                began=began,
+                depth=load_depth(scene, settings.depth, manifest.scene.images, say),
+                normals=load_normals(scene, settings.normals, say),
+                ranks=ranks,
             )
         _require_same_run(ranks, scene, settings)
         run = _ready(run)

@@ -99,7 +99,7 @@ class StageRun:
         densifier: density control with its statistics.
         exposures: colour transforms of the training views; None without compensation of exposure.
         poses: corrections of the training views' poses; None without refinement.
-        geometry: supervises depth and sky; None without.
+        geometry: supervises depth, normals and sky; None without.
         record: measures it.
         budget: decides the stage's length by the clock; None where it is planned.
         say: shows a line to the user.
@@ -476,14 +476,14 @@ class StageRun:
     def _with_geometry(
         self, loss: Tensor, iterations: Sequence[int], views: Sequence[LevelView], shown: GaussianField
     ) -> Tensor:
-        """Return the mean loss of some views with that of their depth and sky, if they have any."""
-        if self.geometry is None:
-            return loss
+        """Return the mean loss of some views with those of their depth, normals and sky, if any."""
         names, cameras = [view.name for view in views], [view.camera for view in views]
-        weight = depth_weight(self.prepared.plan, self.stage, iterations[-1])
-        own = self.geometry.loss(iterations, names, cameras, shown, weight)
+        if self.geometry is not None:
+            weight = depth_weight(self.prepared.plan, self.stage, iterations[-1])
+            own = self.geometry.loss(iterations, names, cameras, shown, weight)
+            loss = loss if own is None else loss + own
         coarser = [] if self.joint is None else self.joint.sky_losses(iterations, names)
-        return sum(coarser, loss if own is None else loss + own)
+        return sum(coarser, loss)
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Call the hooks that come before a render; return the loss of some views by all hooks."""

@@ -20,7 +20,7 @@ from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View
-from lapgs_plugin.stages.geometry import StageGeometry, depths_of, skies_of
+from lapgs_plugin.stages.geometry import StageGeometry, at_level, depths_of, skies_of
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.exposure import DIFFERENT, ViewExposures, from_gains, identities, start_from
@@ -114,7 +114,7 @@ def joint_fields(run: PreparedRun, poses: ViewPoses | None, states: dict[int, di
         rasterizer=run.rasterizer,
         background=run.background,
         poses=poses,
-        skies={level: sky for level in levels if (sky := _geometry(run, level, with_depth=False)) is not None},
+        skies={level: sky for level in levels if (sky := _geometry(run, run.plan[level], jointly=True)) is not None},
     )
 
 
@@ -128,16 +128,18 @@ def first_poses(run: PreparedRun, stage: Stage) -> ViewPoses | None:
 
 
 def stage_geometry(run: PreparedRun, stage: Stage) -> StageGeometry | None:
-    """Return the supervision of depth and sky in a stage, if there is any; a residual has no depth."""
-    return _geometry(run, stage.level, with_depth=not stage.signed)
+    """Return the supervision of depth, normals and sky in a stage, if there is any; a residual has no depth."""
+    return _geometry(run, stage, jointly=False)
 
 
-def _geometry(run: PreparedRun, level: int, *, with_depth: bool) -> StageGeometry | None:
+def _geometry(run: PreparedRun, stage: Stage, *, jointly: bool) -> StageGeometry | None:
     views = run.owned(run.scene.train)
-    cameras = {view.name: view.camera for view in level_views(views, level)}
+    cameras = {view.name: view.camera for view in level_views(views, stage.level)}
+    with_depth = not (stage.signed or jointly)
     depths = depths_of(run.depth, cameras, run.device) if with_depth and run.depth is not None else {}
+    normals = at_level(run.normals, cameras, run.device) if with_depth else {}
     skies = skies_of(views, cameras, run.device)
-    return StageGeometry(run.rasterizer, depths, skies) if depths or skies else None
+    return StageGeometry(run.rasterizer, depths, normals, skies) if depths or normals or skies else None
 
 
 def first_exposures(

@@ -301,7 +301,7 @@ def test_weight_falls_over_the_levels_that_have_depth() -> None:
 
 def test_views_without_depth_have_no_loss() -> None:
     targets = {"a": torch.full((40, 56), 0.25), "c": torch.full((40, 56), torch.nan)}
-    stage, field, camera = StageGeometry(CpuRasterizer(), targets, {}), blob_field(50), ring_camera(0.0)
+    stage, field, camera = StageGeometry(CpuRasterizer(), targets, {}, {}), blob_field(50), ring_camera(0.0)
     own = stage.loss([2], ["a"], [camera], field, 1.0)
     assert own is not None
     assert float(own) > 0
