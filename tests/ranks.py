@@ -40,11 +40,11 @@ def plain_scene() -> Scene:
 
 
 def masked_scene() -> Scene:
-    """The scene with the upper part of every second photo outside of its mask."""
+    """The scene with sky in the upper part of every second photo, outside of its mask."""
     scene = plain_scene()
     inside = torch.ones(1, *scene.train[0].image.shape[1:], dtype=torch.bool)
     inside[:, :12] = False
-    views = [replace(view, mask=inside) if index % 2 else view for index, view in enumerate(scene.train)]
+    views = [replace(view, mask=inside, sky=~inside) if index % 2 else view for index, view in enumerate(scene.train)]
     return replace(scene, train=tuple(views))
 
 

@@ -162,9 +162,17 @@ def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str 
     """Write the options of a new run into its folder; return those of one that is extended, to be written after it."""
     if run.resumes:
         return extended_config(path, run.settings) if run.settings.extended else None
-    masks = run.archive.manifest.scene.masks
+    photos = run.archive.manifest.scene
     length = run.settings.iterations if run.settings.time is None else None
-    write_config(path, context, masks=masks, iterations=length, depth=run.settings.depth)
+    write_config(
+        path,
+        context,
+        masks=photos.masks,
+        sky=photos.sky,
+        iterations=length,
+        depth=run.settings.depth,
+        normals=run.settings.normals,
+    )
     return None
 
 

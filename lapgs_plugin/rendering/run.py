@@ -54,6 +54,7 @@ def load_reference(
         images=reference.images,
         eval=reference.eval,
         masks=reference.masks,
+        sky=reference.sky,
         background=reference.background,
         check=check,
         hold=hold,
@@ -72,12 +73,13 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         SceneError: it cannot be read.
     """
     reference, path = _scene_folder(archive, moved_to)
-    if reference.masks not in (NONE, ALPHA) and not is_folder(path / reference.masks):
-        otherwise = "" if moved_to is None else " or give the scene of this run with --scene"
-        raise RunFolderError(
-            f"{archive.path()} was trained with the masks in {path / reference.masks}, which are not there any more; "
-            f"put them back{otherwise}"
-        )
+    for masks in {reference.masks, reference.sky} - {NONE, ALPHA}:
+        if not is_folder(path / masks):
+            otherwise = "" if moved_to is None else " or give the scene of this run with --scene"
+            raise RunFolderError(
+                f"{archive.path()} was trained with the masks in {path / masks}, which are not there any more; "
+                f"put them back{otherwise}"
+            )
     with _errors_about_scene(archive, moved_to):
         scene = load_reference(replace(reference, path=str(path)), hold=False)
     require_same_scene(archive, scene.path, scene.smallest_size)

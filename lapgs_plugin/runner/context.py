@@ -26,6 +26,7 @@ from lapgs_plugin.hooks import StageHook
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.archived_values import ADAPTER_MENDS, NO_RESIDUALS, explain_other_values
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
+from lapgs_plugin.runner.depth import CheckoutDepth
 from lapgs_plugin.runner.hook_calls import HookCaller
 from lapgs_plugin.runner.iteration_parts import IterationParts
 from lapgs_plugin.runner.late_scalars import LateScalars
@@ -80,6 +81,7 @@ class CheckoutContext:
         stages: hold the running stage, or that of the dry run.
         scalars: write what the loop logs for TensorBoard.
         began: file-system time (ns) just before the main block.
+        depth: of the training views, once the scene was read; None without.
     """
 
     def __init__(self, request: RunRequest) -> None:
@@ -93,6 +95,7 @@ class CheckoutContext:
         with tempfile.TemporaryFile() as file:  # its clock is behind `time.time_ns`
             self.began = os.fstat(file.fileno()).st_mtime_ns
         self._told: set[str] = set()
+        self.depth: CheckoutDepth | None = None
 
     def compare(self, captured: Captured, field: GaussianField, *, residual_follows: bool, state: str = "") -> None:
         """Compare what the checkout renders of a model with its archived field, and warn once if they differ.

@@ -37,6 +37,7 @@ from lapgs_plugin.rasterizers.signed_color import PROBE_TOLERANCE, ColorPath, ex
 from lapgs_plugin.runner.archived_values import NESTED_WORKS
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext
+from lapgs_plugin.runner.depth import require_depth
 from lapgs_plugin.runner.object_values import fields_of, with_values
 from lapgs_plugin.runner.rasterizer_choice import Decision, decide
 from lapgs_plugin.runner.rasterizer_trial import RasterizerCall, trials_of
@@ -176,6 +177,16 @@ class DryRun:
                 self._render(self._view(self._scene.train[0]), self._new_model())
             except Exception as error:  # the loop may do what is missing here
                 logger.debug("no view could be rendered before the first iteration: %s", typed_line(error))
+
+    def require_depth(self) -> None:
+        """Check that the rasterizer renders depths, where --depth asks for them.
+
+        Raises:
+            UserInputError: it does not.
+        """
+        with undisturbed(self._context.device), self._step("a view with depth", "one as without lapgs", OFF):
+            captured = self._render(self._view(self._scene.train[0]), self._new_model())
+            require_depth(self._context.request.settings.depth, captured)
 
     def _new_model(self) -> Any:
         """Return the checkout's model of some of the scene's points."""

@@ -90,8 +90,13 @@ class HookCaller(HookDispatcher):
         image = self.compose(context, image)
         term = self.extra_loss(context, image)
         done = partial(self.after_backward, context)
-        result: Tensor = _WithTerm.apply(image, term, done)  # type: ignore[no-untyped-call]  # torch's
+        result = with_term(image, term, done)
         return result if added is None else result - added
+
+    @property
+    def paused(self) -> bool:
+        """Whether a score of density control is being computed."""
+        return self._paused
 
     def _make_context(self, key: str, below: Tensor | None) -> StageContext:
         running = self._stages.running
@@ -111,6 +116,18 @@ class HookCaller(HookDispatcher):
             self.on_densify(self._context)
 
 
+def with_term(image: Tensor, term: Tensor | None, done: Callable[[], None] | None = None) -> Tensor:
+    """Return the image unchanged; a backward pass through it adds the gradients of a term of the loss.
+
+    Args:
+        image: (3, h, w).
+        term: weighted; None for none.
+        done: called at the end of that backward pass.
+    """
+    result: Tensor = _WithTerm.apply(image, term, done)  # type: ignore[no-untyped-call]  # torch's
+    return result
+
+
 class _WithTerm(torch.autograd.Function):
     """Return the image unchanged; the backward pass gives the term a gradient of one."""
 
@@ -121,6 +138,7 @@ class _WithTerm(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        # The engine calls it at the end of this backward pass; data-parallel training relies on the same.
-        torch.autograd.Variable._execution_engine.queue_callback(ctx.done)
+        if ctx.done is not None:
+            # The engine calls it at the end of this backward pass; data-parallel training relies on the same.
+            torch.autograd.Variable._execution_engine.queue_callback(ctx.done)
         return gradient, gradient.new_ones(()) if ctx.term else None, None

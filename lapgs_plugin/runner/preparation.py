@@ -22,6 +22,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.registry import NONE
 from lapgs_plugin.runner.checkout_scene import CheckoutScene
 from lapgs_plugin.runner.context import CheckoutContext, TrainingRun
+from lapgs_plugin.runner.depth import CheckoutDepth
 from lapgs_plugin.runner.dry_run import DryRun, full_gpu_told
 from lapgs_plugin.runner.manifest import make_manifest, require_same_run
 from lapgs_plugin.runner.rasterizer_choice import Decision, decided_without_trials
@@ -71,6 +72,10 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
         scene = CheckoutScene.load(call, adapter, Path(scratch))
         scene.check_points()
         images.read_masks(source, settings.masks)
+        keys = [images.key(camera) for camera in scene.train]
+        context.depth = CheckoutDepth.load(
+            settings.depth, call.dataset, images, keys, context.stages, context.hooks, context.device
+        )
         adapter.first_points(len(scene.points.points))
         size = images.smallest_size()
         settings = settings.for_size(size)
@@ -84,8 +89,12 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
             path = dry_run.color_path() if settings.has_residuals else ColorPath.NATIVE
             if settings.dry_run:
                 dry_run.run(Path(scratch, "dry_run"), path)
-            elif not settings.has_residuals and (context.hooks or images.masked or settings.appearance != NONE):
+            elif not settings.has_residuals and (
+                context.hooks or images.masked or context.depth or settings.appearance != NONE
+            ):
                 dry_run.find_image()
+            if context.depth is not None:
+                dry_run.require_depth()
         manifest = make_manifest(adapter, settings, call, plan, bool(scene.test), rasterizer)
         with _open_archive(context, absolute, manifest) as archive:
             yield TrainingRun(

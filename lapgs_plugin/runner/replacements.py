@@ -21,6 +21,7 @@ from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import timing_replacements
 from lapgs_plugin.runner.visible_rows import VisibleRows
+from lapgs_plugin.scenes.masks import NONE
 
 STATISTICS = "add_densification_stats"
 """Method of the family's models that sums gradients of the Gaussians that a view shows."""
@@ -121,7 +122,7 @@ class StageReplacements:
         """Return replacements of score functions, after the adapter's of the same functions."""
         hooks, names = self._context.hooks, self._context.adapter.info.density_scores
         consumer = "training() when it densifies and prunes"
-        scores = profile.named(names) if hooks else []
+        scores = profile.named(names) if hooks or self._context.request.settings.depth != NONE else []
         return [Replacement(owner, name, hooks.pausing, consumer) for owner, name in scores]
 
     def _in_losses(self, profile: Profile) -> list[Replacement]:

@@ -79,6 +79,12 @@ class RunSettings(HierarchySettings):
         names=("--dry-run/--no-dry-run",),
     )
 
+    depth: str = option(
+        "none",
+        "Supervise depth in all levels but residuals, beside the script's loss: a folder of depth maps named as the "
+        "photos, points (those of COLMAP that a photo sees), auto (the scene's folder depth/, if any), or none.",
+    )
+
     masks: str = option(
         "auto",
         "Masks of the photos: a folder of images that are black where a photo is ignored, none, or auto (the scene's "
@@ -93,7 +99,7 @@ class RunSettings(HierarchySettings):
     @property
     def paper_settings(self) -> Mapping[str, object]:
         """See `HierarchySettings.paper_settings`."""
-        return {**super().paper_settings, "appearance": NONE}
+        return {**super().paper_settings, "appearance": NONE, "depth": NONE}
 
     @property
     def shares(self) -> tuple[Fraction, ...] | None:

@@ -23,6 +23,7 @@ from lapgs_plugin.stages.joint import Predictions
 
 logger = logging.getLogger(__name__)
 
+OnCall = Callable[[str, Tensor, Callable[..., Any], Mapping[str, Any], Any], Tensor]
 GREY = 0.5
 """Value added to residuals for cameras that are no view of the scene, such as a viewer's."""
 
@@ -64,6 +65,8 @@ class StageRendering:
             without composition); returns the image to use instead.
         as_photographed: called with key and composed image; returns the image with the appearance of its photo, which
             the loop compares with the photo. None with `--appearance none`.
+        on_call: called when gradients are recorded with key, composed image, rasterizer, its inputs and its settings;
+            returns the image to use instead.
         capture: keep the last call in `captured`, its image without the appearance of a photo.
     """
 
@@ -76,6 +79,7 @@ class StageRendering:
     composed: frozenset[str] = frozenset()
     on_image: Callable[[str, Tensor, Tensor | None], Tensor] | None = None
     as_photographed: Callable[[str, Tensor], Tensor] | None = None
+    on_call: OnCall | None = None
     capture: bool = False
     captured: Captured | None = field(default=None, repr=False)
     _told: bool = field(default=False, repr=False)
@@ -93,16 +97,16 @@ class StageRendering:
         """
         if noted is not None and noted in self.views:
             return noted
-        if noted is not None or not self.views or not (self._needs_views or self.on_image is not None):
+        if noted is not None or not self.views or not (self._needs_views or self._asks_for_views):
             return None
         keys = self._keys_by_matrix(settings)
         # Photos of one camera have the same prediction, but not the same mask or target.
-        differ = self._needs_photos or self.on_image is not None or 0 < len(keys & self.composed) < len(keys)
+        differ = self._needs_photos or self._asks_for_views or 0 < len(keys & self.composed) < len(keys)
         if len(keys) > 1 and differ:
             names = " and ".join(view_name(key) for key in sorted(keys)[:2])
             raise UserInputError(
                 f"{names} have the same camera, and the checkout's rasterizer gets only that: which photo it renders "
-                "is unknown; leave one of them out, or train with --hierarchy nested, without --masks, "
+                "is unknown; leave one of them out, or train with --hierarchy nested, without --masks, --depth, "
                 "--appearance and hooks"
             )
         return min(keys, default=None)
@@ -209,7 +213,10 @@ class StageRendering:
         if self.signed and self.path is ColorPath.PRECOMPUTED:
             inputs = with_signed_colors(inputs, settings)
         outputs = RasterOutputs.of(rasterizer(**inputs), size_of(settings))
-        image = self.compose(self.key(noted, settings), outputs.image, by_matrix=noted is None)
+        key = self.key(noted, settings)
+        image = self.compose(key, outputs.image, by_matrix=noted is None)
+        if key is not None and self.on_call is not None and torch.is_grad_enabled():
+            image = self.on_call(key, image, rasterizer, inputs, settings)
         if self.capture:
             self.captured = Captured(image, rasterizer, inputs, settings)
         for values in outputs.maps_beside if self.signed else ():
@@ -256,6 +263,11 @@ class StageRendering:
     def _needs_photos(self) -> bool:
         """Whether images are trained otherwise for each photo."""
         return bool(self.masked) or self.as_photographed is not None
+
+    @property
+    def _asks_for_views(self) -> bool:
+        """Whether something besides the image depends on the view."""
+        return self.on_image is not None or self.on_call is not None
 
     @property
     def _below_target(self) -> Predictions | None:

@@ -74,6 +74,9 @@ class StageViews:
             on_image=run.context.hooks.on_image if run.context.hooks else None,
             as_photographed=None if self.appearance is None else self._as_photographed,
         )
+        if run.context.depth is not None and not stage.signed:
+            sizes = {key: self.size(key, stage.level) for key in self.train}
+            self.rendering.on_call = run.context.depth.in_stage(run.plan, stage, sizes)
 
     def load_images(self) -> None:
         """Make I^l of every view, and Up(I^(l+1)) of training views if the supervision needs it."""

@@ -71,6 +71,7 @@ class SceneReference:
         images: name of the image folder in a COLMAP scene.
         masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
         unit: the length in the scene's units that is 1 for the rasterizer, see `scenes.Scene`.
+        sky: "none", or the folder of masks of the sky.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -83,6 +84,7 @@ class SceneReference:
     images: PathText = "images"
     masks: PathText = "none"
     unit: Annotated[float, Field(gt=1e-30, lt=1e30)] = 1.0
+    sky: PathText = "none"
 
     @classmethod
     def of(

@@ -223,11 +223,11 @@ def fit_scale_and_shift(values: Tensor, wanted: Tensor, valid: Tensor) -> Tensor
     return torch.where(usable, result, 0.0).float()
 
 
-def find_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Return the depth maps of those images that have one, by the images' names.
+def find_maps(folder: Path, names: Sequence[str], ends: Sequence[str] = ENDS) -> dict[str, Path]:
+    """Return the maps of those images that have one, by the images' names.
 
-    That of a.jpg is a.png or a_depth.png, or another file of `SUFFIXES`. Folders that hold all photos, such as images/,
-    may be left out, and all folders if no two photos have the same name without them.
+    That of a.jpg is a.png, or a_depth.png if `ends` has "_depth", or another file of `SUFFIXES`. Folders that hold all
+    photos, such as images/, may be left out, and all folders if no two photos have the same name without them.
     """
     common = common_folder(names)
     bare = Counter(PurePosixPath(stem_of(name)).name.lower() for name in names)
@@ -242,7 +242,7 @@ def find_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         inner = sorted((folder / parent).iterdir()) if is_folder(folder / parent) else []
         for file in sorted((file for file in inner if file.suffix.lower() in SUFFIXES), key=_preference):
             present.setdefault(file.relative_to(folder).with_suffix("").as_posix().lower(), file)
-    keys = {name: [f"{stem}{end}".lower() for stem in stems for end in ENDS] for name, stems in spelled.items()}
+    keys = {name: [f"{stem}{end}".lower() for stem in stems for end in ends] for name, stems in spelled.items()}
     chosen = {name: next((present[key] for key in tried if key in present), None) for name, tried in keys.items()}
     return {name: file for name, file in chosen.items() if file is not None}
 

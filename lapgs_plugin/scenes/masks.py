@@ -1,4 +1,4 @@
-"""Find and read masks of photos: white where a photo shows the scene, black where it is ignored."""
+"""Find and read masks of photos, white where a photo shows the scene, and of their sky, white where they show it."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from lapgs_plugin.untrusted import require_regular
 MASKS = "masks"
 """Folder of masks in a scene that `lapgs prepare` writes."""
 AUTO, NONE, ALPHA = "auto", "none", "alpha"
+BLACK = 0.5 / 255
+"""Largest value of a mask that is black everywhere."""
 HEIC = (".heic", ".heif", ".hif")
 """Photos of phones that neither COLMAP nor OpenImageIO reads."""
 
@@ -45,15 +47,63 @@ def resolve_masks(scene: Path, setting: str) -> str:
     return str(Path(setting).absolute())
 
 
+def resolve_sky(scene: Path, setting: str) -> str:
+    """Resolve a value of --sky for a scene: "none", or a folder, relative to the scene or absolute.
+
+    Raises:
+        UserInputError: there is no such folder.
+    """
+    if setting == NONE or is_folder(scene / setting):
+        return setting
+    if not is_folder(Path(setting)):
+        raise UserInputError(
+            f"--sky {setting}: no such folder; expected a folder of masks, white where sky is, or none"
+        )
+    return str(Path(setting).absolute())
+
+
 def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the mask file of each image by its name.
+
+    Raises:
+        SceneError: an image has no mask, or several.
+    """
+    masks, shorter = _masks_of(folder, names)
+    if missing := [shorter[name] for name in names if name not in masks]:
+        stem = stem_of(missing[0])
+        raise SceneError(
+            f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
+            f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
+            "whole photo), or use no masks (in training: --masks none)"
+        )
+    return masks
+
+
+def find_sky(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the masks of the sky of those images that have one, by their names.
+
+    Raises:
+        SceneError: no image has one, or an image has several.
+    """
+    masks, shorter = _masks_of(folder, names)
+    if not masks:
+        stem = stem_of(shorter[names[0]])
+        raise SceneError(
+            f"{folder}: no photo of {len(names)} has a mask of its sky, expected files such as "
+            f"{printable(f'{stem}.png or {stem}_mask.png')}; give their folder, or train without --sky"
+        )
+    return masks
+
+
+def _masks_of(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], dict[str, str]]:
+    """Return the masks of those images that have one, by name, and the names without a folder that holds all.
 
     The mask of a.jpg is a.jpg.png as in COLMAP, a.png (or another image file), or a_mask.png, in the same subfolder. A
     folder that holds all photos, such as images/, may be left out. Other folders are not searched, because `folder` may
     be a whole disk by mistake.
 
     Raises:
-        SceneError: an image has no mask, or several.
+        SceneError: an image has several.
     """
     common = common_folder(names)
     shorter = {name: name.removeprefix(common) for name in names}
@@ -64,14 +114,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     for file in sorted(files):  # cameras write .JPG, other programs .jpg
         present.setdefault(file.relative_to(folder).as_posix().lower(), []).append(file)
     masks = {name: _mask_of(folder, present, name) or _mask_of(folder, present, shorter[name]) for name in names}
-    if missing := [shorter[name] for name, path in masks.items() if path is None]:
-        stem = stem_of(missing[0])
-        raise SceneError(
-            f"{folder}: {len(missing)} of {len(names)} photos have no mask, the first is {printable(missing[0])}; "
-            f"expected {printable(f'{missing[0]}.png, {stem}.png or {stem}_mask.png')}: add it (all white to use the "
-            "whole photo), or use no masks (in training: --masks none)"
-        )
-    return {name: path for name, path in masks.items() if path is not None}
+    return {name: path for name, path in masks.items() if path is not None}, shorter
 
 
 def common_folder(names: Sequence[str]) -> str:
@@ -80,8 +123,8 @@ def common_folder(names: Sequence[str]) -> str:
     return tops.pop() if len(tops) == 1 else ""
 
 
-def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None:
-    """Check that no photo is its own mask, as if --masks names the folder of the photos.
+def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path], option: str = "--masks") -> None:
+    """Check that no photo is its own mask, as if an option for masks names the folder of the photos.
 
     Raises:
         SceneError: one is, or a mask is no file.
@@ -93,7 +136,7 @@ def refuse_photos(masks: Mapping[str, Path], photos: Mapping[str, Path]) -> None
             raise SceneError(f"{mask} cannot be read: {error.strerror}; expected a mask, put it there") from error
         if mask.samefile(photos[name]):
             raise SceneError(
-                f"--masks {mask.parent}: {printable(mask.name)} is the photo itself, expected its mask; give the "
+                f"{option} {mask.parent}: {printable(mask.name)} is the photo itself, expected its mask; give the "
                 "folder of the masks"
             )
 
@@ -134,6 +177,37 @@ def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tens
     Raises:
         SceneError: it cannot be read, has another shape, or is black everywhere.
     """
+    return _inside(_read_grey(path, photo, size), path)
+
+
+def read_sky(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:
+    """Read the mask of a photo's sky as `read_mask` does, (1, h, w) bool, True in the sky; black has none.
+
+    Raises:
+        SceneError: it cannot be read, or has another shape.
+    """
+    values = _read_grey(path, photo, size)
+    highest = float(values.max())
+    return values > 0.5 * min(highest, 1.0) if highest > BLACK else torch.zeros_like(values, dtype=torch.bool)
+
+
+def outside_sky(mask: Tensor | None, sky: Tensor, path: Path) -> Tensor:
+    """Return what a mask (1, h, w) leaves outside of the sky; None is all of the photo.
+
+    Raises:
+        SceneError: nothing.
+    """
+    rest = ~sky if mask is None else mask & ~sky
+    if not bool(rest.any()):
+        raise SceneError(
+            f"{path}: the photo shows nothing but sky, or what its mask hides, expected white in the sky alone; leave "
+            "the photo out, or correct the mask"
+        )
+    return rest
+
+
+def _read_grey(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tensor:
+    """Return the grey values (1, h, w) of a mask at a size, after comparing its shape with the photo's."""
     width, height = image_size(path)
     if not same_shape((width, height), photo):
         turned = " (EXIF turns photos for display; masks belong to stored pixels)" if width == photo[1] else ""
@@ -141,7 +215,7 @@ def read_mask(path: Path, photo: tuple[int, int], size: tuple[int, int]) -> Tens
             f"{path}: the mask is {width}x{height} pixels, its photo {photo[0]}x{photo[1]}{turned}; expected the same "
             "size, make it again from this photo"
         )
-    return _inside(read_image(path, size=size).mean(0, keepdim=True), path)
+    return read_image(path, size=size).mean(0, keepdim=True)
 
 
 def alpha_mask(photo: Path, size: tuple[int, int]) -> Tensor | None:
@@ -169,7 +243,7 @@ def write_mask(path: Path, mask: Tensor) -> None:
 
 def _inside(values: Tensor, path: Path) -> Tensor:
     highest = float(values.max())
-    if highest <= 0.5 / 255:
+    if highest <= BLACK:
         raise SceneError(
             f"{path}: the mask is black everywhere, expected white where the photo shows the scene; leave the photo out"
         )

@@ -30,6 +30,11 @@ class SceneOptions:
         "Masks of the photos: a folder of images that are black where a photo is ignored, alpha (the photos' own alpha "
         "channels), none, or auto (the scene's folder masks/, or mask_path of transforms.json, or none).",
     )
+    sky: str = option(
+        "none",
+        "Masks of the sky: a folder of images that are white where a photo shows sky, or none. All levels are trained "
+        "to be transparent there, and the photos' sky is left out as by --masks.",
+    )
     background: str = option(
         "black", "Background of renders and of transparent pixels: black, white or R,G,B from 0 to 1."
     )

@@ -33,10 +33,14 @@ from lapgs_plugin.scenes.masks import (
     NONE,
     alpha_mask,
     find_masks,
+    find_sky,
     has_photo_suffix,
+    outside_sky,
     read_mask,
+    read_sky,
     refuse_photos,
     resolve_masks,
+    resolve_sky,
 )
 from lapgs_plugin.scenes.parallel import ProgressCallback, ahead, in_threads, readers_of
 from lapgs_plugin.scenes.resolution import Resolution, parse_resolution
@@ -82,21 +86,23 @@ class _Pixels(Generic[_Held]):
 class View:
     """An image and its camera.
 
-    `image` and `mask` may be given as functions without arguments, which are called at each access: such a view takes
-    no memory. `at` keeps the functions; `dataclasses.replace` would keep their results.
+    `image`, `mask` and `sky` may be given as functions without arguments, which are called at each access: such a view
+    takes no memory. `at` keeps the functions; `dataclasses.replace` would keep their results.
 
     Attributes:
         name: unique name of the image, such as "0001.jpg" or "train/r_0.png", relative to the image folder of a COLMAP
             scene or to the scene folder of other layouts.
         camera: size, intrinsics and pose, float32; its size is the image's.
         image: (3, h, w) float32 RGB on the CPU, in [0, 1] unless the file holds wider values (EXR).
-        mask: (1, h, w) bool, False where the image is ignored; None uses all of it.
+        mask: (1, h, w) bool, False where the image is ignored, as in its sky; None uses all of it.
+        sky: (1, h, w) bool, True where the scene has to be transparent; None without a mask of the sky.
     """
 
     name: str
     camera: Camera
     image: _Pixels[Tensor] = _Pixels[Tensor]()  # noqa: RUF009  # (3, h, w)
     mask: _Pixels[Tensor | None] = _Pixels[Tensor | None](optional=True)  # noqa: RUF009  # (1, h, w)
+    sky: _Pixels[Tensor | None] = _Pixels[Tensor | None](optional=True)  # noqa: RUF009  # (1, h, w)
 
     @property
     def masked(self) -> bool:
@@ -110,7 +116,7 @@ class View:
 
     def at(self, camera: Camera) -> View:
         """Return the view with another camera of the same size."""
-        return View(self.name, camera, vars(self)["_image"], vars(self)["_mask"])
+        return View(self.name, camera, *(vars(self)[f"_{pixels}"] for pixels in ("image", "mask", "sky")))
 
 
 def with_pixels(views: Sequence[View]) -> Iterator[View]:
@@ -166,6 +172,7 @@ def load_scene(
     images: str = "images",
     eval: bool = False,
     masks: str = AUTO,
+    sky: str = NONE,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: bool | ProgressCallback = True,
     check: Callable[[tuple[int, int], int], None] | None = None,
@@ -184,6 +191,7 @@ def load_scene(
         images: name of the image folder, such as "images_4" for smaller copies.
         eval: hold out every eighth view in name order, or those that a transforms layout names.
         masks: as `masks.resolve_masks` takes it.
+        sky: as `masks.resolve_sky` takes it.
         background: RGB behind transparent pixels.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
@@ -194,20 +202,24 @@ def load_scene(
 
     Raises:
         SceneError: the folder, its model, an image or a mask cannot be used.
-        UserInputError: the resolution cannot be parsed, there is no such folder of masks, or no image has the
-            transparent pixels that `masks` asks for.
+        UserInputError: the resolution cannot be parsed, there is no such folder of masks or of those of the sky, or no
+            image has the transparent pixels that `masks` asks for.
     """
     rule = parse_resolution(resolution)
     path = Path(path)
-    masks = resolve_masks(path, masks)
+    masks, sky = resolve_masks(path, masks), resolve_sky(path, sky)
     source = _checked_source(path, images, eval)
     require_places(torch.from_numpy(source.points), f"{path}:")
     for warning in source.warnings:
         logger.warning(warning)
     frames = [*source.train, *source.test]
-    mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, [frame.name for frame in frames])
+    names = [frame.name for frame in frames]
+    mask_files = {} if masks in (NONE, ALPHA) else find_masks(path / masks, names)
+    sky_files = {} if sky == NONE else find_sky(path / sky, names)
     cameras = [_sized_camera(frame, rule) for frame in frames]
-    refuse_photos(mask_files, {frame.name: frame.path for frame in frames})
+    photos = {frame.name: frame.path for frame in frames}
+    refuse_photos(mask_files, photos)
+    refuse_photos(sky_files, photos, "--sky")
     if check is not None:
         check(smallest_of(cameras), len(source.train))
     short = [camera.width for frame, camera in zip(frames, cameras, strict=True) if rule.falls_short(camera.width)]
@@ -229,17 +241,27 @@ def load_scene(
                 return read_as_3dgs(frame.path, size, behind)
             return read_image(frame.path, size=size, background=background)
 
+        def in_sky() -> Tensor | None:
+            file = sky_files.get(frame.name)
+            return None if file is None else read_sky(file, image_size(frame.path), size)
+
         def mask() -> Tensor | None:
             if mask_files:
-                return read_mask(mask_files[frame.name], image_size(frame.path), size)
-            return alpha_mask(frame.path, size) if masks == ALPHA else None
+                own: Tensor | None = read_mask(mask_files[frame.name], image_size(frame.path), size)
+            else:
+                own = alpha_mask(frame.path, size) if masks == ALPHA else None
+            return own if (above := in_sky()) is None else outside_sky(own, above, sky_files[frame.name])
 
         if not read:
-            return View(frame.name, camera, image, mask if mask_files or masks == ALPHA else None)
-        pixels, inside = image(), mask()
+            masked = bool(mask_files) or masks == ALPHA or frame.name in sky_files
+            return View(
+                frame.name, camera, image, mask if masked else None, in_sky if frame.name in sky_files else None
+            )
+        pixels, inside, above = image(), mask(), in_sky()
         if hold:
-            return View(frame.name, camera, pixels, inside)
-        return View(frame.name, camera, image, None if inside is None else mask)
+            return View(frame.name, camera, pixels, inside, above)
+        later = None if inside is None else mask, None if above is None else in_sky
+        return View(frame.name, camera, image, *later)
 
     items = list(zip(frames, cameras, strict=True))
     shown, readers = progress and read, readers_of(camera.size for camera in cameras)
@@ -270,7 +292,7 @@ def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = Tru
     """
 
     def held(view: View) -> View:
-        return View(view.name, view.camera, view.image, view.mask)
+        return View(view.name, view.camera, view.image, view.mask, view.sky)
 
     readers = readers_of(view.camera.size for view in views)
     return in_threads("Reading images", "images", held, views, most=readers, progress=progress)

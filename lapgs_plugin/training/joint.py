@@ -15,6 +15,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.stages.geometry import StageGeometry
 from lapgs_plugin.stages.joint import RenderedPredictions
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses
@@ -30,6 +31,7 @@ class JointFields:
         rasterizer: renders them.
         background: (3,) behind the base; residuals are rendered over zero.
         poses: refined poses of the training views, which learn from these renders, too; None without refinement.
+        skies: supervision of their sky by level; empty without.
     """
 
     models: Mapping[int, TrainableField]
@@ -37,6 +39,7 @@ class JointFields:
     rasterizer: Rasterizer
     background: Tensor
     poses: ViewPoses | None
+    skies: Mapping[int, StageGeometry]
     _level_cameras: dict[tuple[str, int], Camera] = dataclass_field(default_factory=dict)
 
     def predictions(self, pyramid: Pyramid) -> RenderedPredictions:
@@ -52,6 +55,14 @@ class JointFields:
             field = model.field if self.poses is None else self.poses.watched(names[0], model.field)
             return self.rasterizer.render_image(field, cameras[0], background=background)
         return self.rasterizer.render_batch(model.field, cameras, background=background, with_geometry=False).image
+
+    def sky_losses(self, iterations: Sequence[int], names: Sequence[str]) -> list[Tensor]:
+        """Return the weighted losses of the fields by the sky of some views; arguments as `StageGeometry.loss`."""
+        losses = []
+        for level, sky in self.skies.items():
+            cameras = [self._camera(name, level) for name in names]
+            losses.append(sky.loss(iterations, names, cameras, self.models[level].field, 0.0))
+        return [loss for loss in losses if loss is not None]
 
     def _camera(self, name: str, level: int) -> Camera:
         """Return a view's camera, always the same object: a rasterizer may know it by that."""

@@ -23,7 +23,8 @@ from lapgs_plugin.runs.gpu_busy import require_cuda
 from lapgs_plugin.runs.layout import CHECKPOINT, require_place, require_room
 from lapgs_plugin.runs.manifest import Manifest, SceneReference
 from lapgs_plugin.scenes.depth import load_depth, resolve_depth
-from lapgs_plugin.scenes.masks import resolve_masks, share_inside
+from lapgs_plugin.scenes.masks import NONE, resolve_masks, resolve_sky, share_inside
+from lapgs_plugin.scenes.normals import load_normals, resolve_normals
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.scene import Scene, View, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
@@ -110,7 +111,15 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     say = say if ranks.leads else _silent
     require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
     depth = resolve_depth(Path(request.scene), settings.depth)
-    request = replace(request, settings=replace(settings, depth=depth, ranks=max(settings.ranks, ranks.size)))
+    normals = resolve_normals(Path(request.scene), settings.normals)
+    if normals != NONE and depth == NONE:
+        raise UserInputError(
+            f"--normals {normals} without depth: normals alone leave surfaces where they are and make their distances "
+            "worse; add --depth with a folder of maps, or --depth points"
+        )
+    request = replace(
+        request, settings=replace(settings, depth=depth, normals=normals, ranks=max(settings.ranks, ranks.size))
+    )
     masks = resolve_masks(Path(request.scene), photos.masks)
     reference = SceneReference(
         path=str(request.scene),
@@ -120,6 +129,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
         kind="",
         images=photos.images,
         masks=masks,
+        sky=resolve_sky(Path(request.scene), photos.sky),
     )
     if request.control.log is not None:
         require_tensorboard()
@@ -156,12 +166,21 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
     depth = load_depth(scene, settings.depth, reference.images, say)
+    normals = load_normals(scene, settings.normals, say)
     reference = replace(reference, path=str(scene.path.absolute()), kind=scene.kind, unit=scene.unit)
     manifest = Manifest(scene=reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
     _require_same_run(ranks, scene, settings)
     with open_for(ranks, out, lambda kind: kind.create(out, manifest, request.overwrite)) as archive:
         run = PreparedRun.of(
-            scene, settings, archive, placed, request.control, began=request.began, depth=depth, ranks=ranks
+            scene,
+            settings,
+            archive,
+            placed,
+            request.control,
+            began=request.began,
+            depth=depth,
+            normals=normals,
+            ranks=ranks,
         )
         run = _ready(run)
         _say_about_photos(run, say)
@@ -227,9 +246,17 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
             scene = load_reference(here, lambda _, photos: _require_views(ranks, photos), **_reading(request, settings))
         require_same_scene(archive, scene_folder, scene.smallest_size)
         with errors_about(file):
-            depth = load_depth(scene, settings.depth, manifest.scene.images, say)
             run = PreparedRun.of(
-                scene, settings, archive, placed, request.control, resumes=True, began=began, depth=depth, ranks=ranks
+                scene,
+                settings,
+                archive,
+                placed,
+                request.control,
+                resumes=True,
+                began=began,
+                depth=load_depth(scene, settings.depth, manifest.scene.images, say),
+                normals=load_normals(scene, settings.normals, say),
+                ranks=ranks,
             )
         _require_same_run(ranks, scene, settings)
         run = _ready(run)
@@ -315,11 +342,17 @@ def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: Tr
 
 
 def _say_about_photos(run: PreparedRun, say: Say) -> None:
-    """Say the share of their pixels inside masks, and whether a CPU takes hours for so many."""
-    views = (*run.scene.train, *run.aside, *run.scene.test)
+    """Say the share of their pixels inside masks and in the sky, and whether a CPU takes hours for so many."""
+    views, scene = (*run.scene.train, *run.aside, *run.scene.test), run.archive.manifest.scene
+    if run.ranks.leads and scene.sky != NONE:
+        skies = [sky for view in views if (sky := view.sky) is not None]
+        say(
+            f"sky ({scene.sky}): {len(skies)} of {len(views)} photos have a mask, {share_inside(skies):.0%} of their "
+            "pixels are sky"
+        )
     if run.ranks.leads and any(view.masked for view in views):
-        share = share_inside(view.mask for view in views)
-        say(f"masks ({run.archive.manifest.scene.masks}): {share:.0%} of the pixels are trained on and measured")
+        share, masks = share_inside(view.mask for view in views), scene.masks if scene.sky == NONE else "and sky"
+        say(f"masks ({masks}): {share:.0%} of the pixels are trained on and measured")
     size = run.plan[0].image_size
     if run.device.type == "cpu" and (hint := long_on_a_cpu(size, run.settings.iterations)):
         say(hint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -49,6 +49,7 @@ class PreparedRun(StagedRun):
         first_field: the first stage starts from it; None starts from the scene's points.
         began: when the seconds of --time began, by `time.monotonic`; None goes on with those that are left.
         depth: of the training views; None without.
+        normals: (3, h, w) of training views by name, as `load_normals` returns them.
         ranks: the processes that train it.
     """
 
@@ -61,6 +62,7 @@ class PreparedRun(StagedRun):
     first_field: GaussianField | None
     began: float | None
     depth: DepthTargets | None
+    normals: Mapping[str, Tensor]
     ranks: Ranks
 
     @classmethod
@@ -76,6 +78,7 @@ class PreparedRun(StagedRun):
         first_field: GaussianField | None = None,
         began: float | None = None,
         depth: DepthTargets | None = None,
+        normals: Mapping[str, Tensor] | None = None,
         ranks: Ranks = ALONE,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
@@ -85,8 +88,9 @@ class PreparedRun(StagedRun):
             settings: of the run.
             archive: open for writing.
             placed: as `backend.training_rasterizer` returns it. The manifest's scene has the unit of its lengths.
-            control, resumes, first_field, began, depth, ranks: see the attributes; by default the run is new, starts
-                from the points without depth, a time begins with the training, and this process trains alone.
+            control, resumes, first_field, began, depth, normals, ranks: see the attributes; by default the run is new,
+                starts from the points without depth and normals, a time begins with the training, and this process
+                trains alone.
 
         Raises:
             UserInputError: as `make_plan`.
@@ -107,6 +111,7 @@ class PreparedRun(StagedRun):
             first_field=first_field,
             began=began,
             depth=depth,
+            normals=normals or {},
             ranks=ranks,
         )
         # With --time their lengths were decided by the clock.

@@ -230,6 +230,12 @@ class TrainSettings(HierarchySettings):
         "folder depth/ or that of an export, or none of them), or none.",
         panel=SCHEDULE,
     )
+    normals: str = option(
+        "none",
+        "Supervise normals beside --depth, in all levels but residuals: a folder of normal maps named as the photos, "
+        "in the axes of their cameras (PNG with (n + 1) / 2 as colours, EXR, NPY), or none.",
+        panel=SCHEDULE,
+    )
     refine_poses: bool = option(
         False,
         "Refine the pose of each training photo while the field trains, for inaccurate poses. Views are then rendered "
@@ -459,6 +465,7 @@ class TrainSettings(HierarchySettings):
                 "decay": 1.0,
                 "appearance": NONE,
                 "depth": NONE,
+                "normals": NONE,
                 "refine_poses": False,
             },
             "dropout": 0.0,

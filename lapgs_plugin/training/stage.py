@@ -24,11 +24,11 @@ from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.stages.appearance import ViewAppearance
+from lapgs_plugin.stages.geometry import StageGeometry, depth_weight
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.stages.view_transforms import ViewTransforms
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
-from lapgs_plugin.training.depth import StageDepth, depth_weight
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.losses import LossOf, ViewLosses
@@ -99,7 +99,7 @@ class StageRun:
         densifier: density control with its statistics.
         appearance: transforms of the training views' images; None with `--appearance none`.
         poses: corrections of the training views' poses; None without refinement.
-        depth: supervises it; None without depth and in residuals.
+        geometry: supervises depth, normals and sky; None without.
         record: measures it.
         budget: decides the stage's length by the clock; None where it is planned.
         say: shows a line to the user.
@@ -121,7 +121,7 @@ class StageRun:
     densifier: DensityControl
     appearance: ViewAppearance | None
     poses: ViewPoses | None
-    depth: StageDepth | None
+    geometry: StageGeometry | None
     record: StageRecord
     say: Callable[[str], None]
     budget: StageBudget | None = None
@@ -455,7 +455,7 @@ class StageRun:
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
         self._breakdown.mark("loss")
-        loss = self._with_depth(loss_of(rendered, shown), iterations, views, shown)
+        loss = self._with_geometry(loss_of(rendered, shown), iterations, views, shown)
         del rendered  # composed by now, and every image of a large size takes memory, as does that of `result`
         kept = loss.detach()
         if result is not None:
@@ -473,14 +473,17 @@ class StageRun:
         self._breakdown.mark("other")
         return _Launch(result, cameras[-1], kept, last, len(views), self.num_optimized)
 
-    def _with_depth(
+    def _with_geometry(
         self, loss: Tensor, iterations: Sequence[int], views: Sequence[LevelView], shown: GaussianField
     ) -> Tensor:
-        """Return the mean loss of some views with that of their depth, if they have any."""
+        """Return the mean loss of some views with those of their depth, normals and sky, if any."""
         names, cameras = [view.name for view in views], [view.camera for view in views]
-        if self.depth is None or (of_depth := self.depth.loss(iterations, names, cameras, shown)) is None:
-            return loss
-        return loss + depth_weight(self.prepared.plan, self.stage, iterations[-1]) * of_depth
+        if self.geometry is not None:
+            weight = depth_weight(self.prepared.plan, self.stage, iterations[-1])
+            own = self.geometry.loss(iterations, names, cameras, shown, weight)
+            loss = loss if own is None else loss + own
+        coarser = [] if self.joint is None else self.joint.sky_losses(iterations, names)
+        return sum(coarser, loss)
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:
         """Call the hooks that come before a render; return the loss of some views by all hooks."""

@@ -23,9 +23,9 @@ from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, from_gains, identities
+from lapgs_plugin.stages.geometry import StageGeometry, at_level, depths_of, skies_of
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
-from lapgs_plugin.training.depth import StageDepth
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
@@ -109,12 +109,14 @@ def joint_fields(run: PreparedRun, poses: ViewPoses | None, states: dict[int, di
         return run.model(run.archive.field(level)) if states is None else run.restored_model(states[level])
 
     views = (*run.scene.train, *run.scene.test, *run.aside)
+    levels = [level for level in run.archive.available_levels if level > 0]
     return JointFields(
-        models={level: model(level) for level in run.archive.available_levels if level > 0},
+        models={level: model(level) for level in levels},
         cameras={view.name: view.camera for view in views},
         rasterizer=run.rasterizer,
         background=run.background,
         poses=poses,
+        skies={level: sky for level in levels if (sky := _geometry(run, run.plan[level], jointly=True)) is not None},
     )
 
 
@@ -127,12 +129,19 @@ def first_poses(run: PreparedRun, stage: Stage) -> ViewPoses | None:
     return ViewPoses.create(scene.train, start, scene.extent, run.device, done, run.plan.iterations)
 
 
-def stage_depth(run: PreparedRun, stage: Stage) -> StageDepth | None:
-    """Return the supervision of depth in a stage; None without depth, and for a residual, which has none."""
-    if run.depth is None or stage.signed:
-        return None
-    cameras = {view.name: view.camera for view in level_views(run.owned(run.scene.train), stage.level)}
-    return StageDepth.create(run.depth, cameras, run.rasterizer, run.device)
+def stage_geometry(run: PreparedRun, stage: Stage) -> StageGeometry | None:
+    """Return the supervision of depth, normals and sky in a stage, if there is any; a residual has no depth."""
+    return _geometry(run, stage, jointly=False)
+
+
+def _geometry(run: PreparedRun, stage: Stage, *, jointly: bool) -> StageGeometry | None:
+    views = run.owned(run.scene.train)
+    cameras = {view.name: view.camera for view in level_views(views, stage.level)}
+    with_depth = not (stage.signed or jointly)
+    depths = depths_of(run.depth, cameras, run.device) if with_depth and run.depth is not None else {}
+    normals = at_level(run.normals, cameras, run.device) if with_depth else {}
+    skies = skies_of(views, cameras, run.device)
+    return StageGeometry(run.rasterizer, depths, normals, skies) if depths or normals or skies else None
 
 
 def first_appearance(

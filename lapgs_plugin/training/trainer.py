@@ -44,7 +44,7 @@ from lapgs_plugin.training.stage_start import (
     first_poses,
     photos_of,
     predict_views,
-    stage_depth,
+    stage_geometry,
 )
 from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
 from lapgs_plugin.training.warm_up import warm_up
@@ -311,7 +311,7 @@ class Trainer:
             densifier=prepared.density_control(stage, schedule),
             appearance=first_appearance(prepared, stage, checkpoint, record.overhead, self.monitor),
             poses=poses,
-            depth=stage_depth(prepared, stage),
+            geometry=stage_geometry(prepared, stage),
             record=record,
             say=self.monitor.say,
             budget=budget,

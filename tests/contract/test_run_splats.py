@@ -309,6 +309,7 @@ REFUSED: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], str]] = {
     "appearance": (("--appearance", "affine"), (), "--appearance affine has no effect"),
     "inherit": (("--inherit", "full"), (), "--inherit full"),
     "masks": (("--masks", "masks"), (), "--masks masks"),
+    "depth": (("--depth", "points"), (), "--depth points"),
     "breakdown": (("--breakdown",), (), "--breakdown"),
     "record": (("--off", "--record"), (), "--record"),
     "patches": ((), ("--patch_size", 16), "--patch_size 16"),

@@ -37,7 +37,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.world import build_world
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.training.depth import StageDepth, depth_loss, depth_weight, mean_inverse_depth
+from lapgs_plugin.stages.geometry import StageGeometry, depth_loss, depth_weight, mean_inverse_depth
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.trainer import Trainer
@@ -260,7 +260,7 @@ def depth_gradients(rasterizer: Rasterizer, device: str, dtype: torch.dtype) -> 
     camera = ring_camera(0.3)
     target = (0.2 + 0.1 * torch.rand(camera.height, camera.width, generator=torch.Generator().manual_seed(3))).to(dtype)
     target[::3] = torch.nan
-    inverse = mean_inverse_depth(rasterizer, field.with_parameters(leaves), camera)
+    inverse = mean_inverse_depth(*render_inverse_depths(rasterizer, field.with_parameters(leaves), camera))
     depth_loss(inverse, target.to(device)).backward()  # type: ignore[no-untyped-call]  # torch's
     return {name: leaf.grad.cpu().double() for name, leaf in leaves.items() if name != "sh" and leaf.grad is not None}
 
@@ -301,14 +301,15 @@ def test_weight_falls_over_the_levels_that_have_depth() -> None:
 
 def test_views_without_depth_have_no_loss() -> None:
     targets = {"a": torch.full((40, 56), 0.25), "c": torch.full((40, 56), torch.nan)}
-    stage, field, camera = StageDepth(CpuRasterizer(), targets), blob_field(50), ring_camera(0.0)
-    own = stage.loss([2], ["a"], [camera], field)
+    stage, field, camera = StageGeometry(CpuRasterizer(), targets, {}, {}), blob_field(50), ring_camera(0.0)
+    own = stage.loss([2], ["a"], [camera], field, 1.0)
     assert own is not None
     assert float(own) > 0
-    assert stage.loss([2], ["b"], [camera], field) is None
-    assert stage.loss([1], ["a"], [camera], field) is None
-    assert stage.loss([2], ["c"], [camera], field) == 0.0
-    both = stage.loss([2, 4], ["a", "b"], [camera, camera], field)
+    torch.testing.assert_close(stage.loss([2], ["a"], [camera], field, 0.25), own / 4)
+    assert stage.loss([2], ["b"], [camera], field, 1.0) is None
+    assert stage.loss([1], ["a"], [camera], field, 1.0) is None
+    assert stage.loss([2], ["c"], [camera], field, 1.0) == 0.0
+    both = stage.loss([2, 4], ["a", "b"], [camera, camera], field, 1.0)
     torch.testing.assert_close(both, own / 2)
 
 

@@ -232,6 +232,10 @@ def refuse_settings(request: SplatRequest) -> None:
         raise UserInputError(f"--inherit full: of {kind} only geometry and xyz are inherited; choose one of them")
     if settings.masks not in ("auto", "none"):
         raise UserInputError(f"--masks {settings.masks}: {kind} read masks themselves; leave it out")
+    if settings.depth != "none":
+        raise UserInputError(
+            f"--depth {settings.depth}: {kind} have a depth loss of their own (--depth_loss); leave it out"
+        )
     if request.measuring.breakdown:
         raise UserInputError(f"--breakdown: the parts of an iteration are not measured in {kind}; leave it out")
     if hooks := chosen_entries("--hooks", HOOKS, settings.hooks):

@@ -17,7 +17,7 @@ from typing import Any
 import pycolmap
 
 from lapgs_plugin.errors import LapgsError, UserInputError
-from lapgs_plugin.scenes.output import check_written
+from lapgs_plugin.scenes.output import check_written, write_model
 from lapgs_plugin.scenes.parallel import ProgressCallback
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.settings import AUTO, EXHAUSTIVE, GLOBAL, RETRIEVAL, SEQUENTIAL, PrepareSettings
@@ -136,6 +136,27 @@ def match_more(job: Job) -> Path | None:
     return guided
 
 
+def configure_rig(job: Job, prefixes: Sequence[str], placed: pycolmap.Reconstruction) -> Path:
+    """Return a copy of the database in which photos of one moment are a frame of a rig.
+
+    Args:
+        job: of the photos.
+        prefixes: of the photos' names by camera, that of reference first. Names that are equal behind them are of one
+            moment.
+        placed: its mean poses of cameras against that of reference are the rig's, and its lenses are taken.
+    """
+    rigged = job.work / "rig.db"
+    if not rigged.is_file():
+        partial, folder = rigged.with_suffix(".partial"), job.work / "free"
+        _copy(job.database, partial)
+        shutil.rmtree(folder, ignore_errors=True)
+        write_model(placed, folder)
+        options = {"database": str(partial.absolute()), "prefixes": list(prefixes), "model": str(folder.absolute())}
+        _run_step(job, "rig", options, [Phase("Finding the rig", "rigs", 1, lambda: 0)])
+        partial.rename(rigged)
+    return rigged
+
+
 def _copy(database: Path, copy: Path) -> None:
     """Copy a database with its write-ahead log, after removing an interrupted copy, whose log would be added."""
     for suffix in ("", "-wal", "-shm"):
@@ -204,6 +225,8 @@ def map_photos(job: Job, attempt: Attempt) -> list[pycolmap.Reconstruction]:
             other = job.work / "simple.db"
             _copy(attempt.database or job.database, other)
             options |= {"database": str(other.absolute()), "camera_model": attempt.lens}
+        elif attempt.database is not None:
+            options["database"] = str(attempt.database.absolute())
         if options["mapper"] == GLOBAL:
             running = re.compile(rb"=== Running ()")
             phase = Phase(attempt.title, "steps", GLOBAL_STEPS, lambda: max(0, _logged(job, running) - 1))

@@ -18,7 +18,17 @@ from lapgs_plugin.scenes.masks import alpha_mask, find_masks, read_mask, refuse_
 from lapgs_plugin.scenes.prepare.clip import pick_frames, write_frames
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import camera_of, convert_photo, listed
-from lapgs_plugin.scenes.prepare.settings import AUTO, FOLDER, IMAGE, ONE, PER_FOLDER, PER_GROUP, PER_IMAGE, SINGLE
+from lapgs_plugin.scenes.prepare.settings import (
+    AUTO,
+    FOLDER,
+    IMAGE,
+    ONE,
+    PER_FOLDER,
+    PER_GROUP,
+    PER_IMAGE,
+    RIG,
+    SINGLE,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -121,17 +131,17 @@ def camera_mode(job: Job, sizes: dict[str, tuple[int, int]]) -> str:
         UserInputError: photos that are said to share one differ in size.
     """
     asked = job.settings.camera_per
-    if asked in (ONE, FOLDER):
+    if asked in (ONE, FOLDER, RIG):
         shared: dict[Path, str] = {}
         for name, size in sizes.items():
-            other = shared.setdefault(Path(name).parent if asked == FOLDER else Path(), name)
+            other = shared.setdefault(Path() if asked == ONE else Path(name).parent, name)
             if size != sizes[other]:
                 raise UserInputError(
                     f"--camera-per {asked}: {job.photos / other} has {sizes[other][0]}x{sizes[other][1]} pixels and "
                     f"{job.photos / name} {size[0]}x{size[1]}, expected one size; leave the option out"
                 )
     if asked != AUTO:
-        return {ONE: SINGLE, FOLDER: PER_FOLDER, IMAGE: PER_IMAGE}[asked]
+        return {ONE: SINGLE, FOLDER: PER_FOLDER, RIG: PER_FOLDER, IMAGE: PER_IMAGE}[asked]
     cameras = Counter((*size, *camera_of(job.photos / name)) for name, size in sizes.items())
     if len(cameras) > 1:
         logger.info("photos of %d cameras or sizes: %s", len(cameras), "; ".join(map(_camera_words, cameras.items())))

@@ -22,7 +22,8 @@ from lapgs_plugin.scenes.prepare.left_out import few_points, left_out_because
 from lapgs_plugin.scenes.prepare.panoramas import are_panoramas, place_panoramas
 from lapgs_plugin.scenes.prepare.photos import Photos, find_photos, listed
 from lapgs_plugin.scenes.prepare.placement import place_cameras
-from lapgs_plugin.scenes.prepare.settings import SEQUENTIAL, PrepareSettings
+from lapgs_plugin.scenes.prepare.rigs import check_rig, place_rig
+from lapgs_plugin.scenes.prepare.settings import RIG, SEQUENTIAL, PrepareSettings
 from lapgs_plugin.scenes.prepare.writing import move_into_place, write_scene
 
 logger = logging.getLogger(__name__)
@@ -97,6 +98,8 @@ def prepare_scene(
             sizes = read_sizes(job)
             panoramas = are_panoramas(job, sizes)
             mode = camera_mode(job, sizes)
+            if settings.camera_per == RIG:
+                check_rig(job)
             make_masks(job)
         if panoramas:
             model, parts = place_panoramas(job, sizes[job.names[0]])
@@ -104,7 +107,7 @@ def prepare_scene(
         else:
             find_features(job, mode)
             match_pairs(job)
-            models = place_cameras(job)
+            models = place_rig(job) if settings.camera_per == RIG else place_cameras(job)
             model, result = models[0], _describe(job, models)
         write_scene(job, model)
         move_into_place(job.work, out)

@@ -10,7 +10,7 @@ from lapgs_plugin.options import check_values, option
 
 AUTO = "auto"
 EXHAUSTIVE, SEQUENTIAL, RETRIEVAL = "exhaustive", "sequential", "retrieval"
-ONE, FOLDER, IMAGE = "one", "folder", "image"
+ONE, FOLDER, IMAGE, RIG = "one", "folder", "image", "rig"
 PER_GROUP, SINGLE, PER_FOLDER, PER_IMAGE = "AUTO", "SINGLE", "PER_FOLDER", "PER_IMAGE"
 """COLMAP's names for photos that share a camera: those of a group by EXIF, all, those of a folder, none."""
 INCREMENTAL, GLOBAL = "incremental", "global"
@@ -67,9 +67,10 @@ class PrepareSettings:
     )
     camera_per: str = option(
         AUTO,
-        "Photos that share a lens. one: all. folder: those of a subfolder, for several cameras. image: each has its "
-        "own. auto: those of the same size, maker and focal lengths by EXIF.",
-        choices=(AUTO, ONE, FOLDER, IMAGE),
+        "Photos that share a lens. one: all. folder: those of a subfolder, for several cameras. rig: the same, of "
+        "cameras that are fixed to each other; photos of one name in all subfolders are of one moment. image: each has "
+        "its own. auto: those of the same size, maker and focal lengths by EXIF.",
+        choices=(AUTO, ONE, FOLDER, RIG, IMAGE),
     )
     model: Path | None = option(
         None,

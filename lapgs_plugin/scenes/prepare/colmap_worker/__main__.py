@@ -41,7 +41,7 @@ def main() -> None:
     pycolmap.logging.logtostderr = True  # and not to files in /tmp as well
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    {"features": find_features, "pairs": match_pairs, "map": map_photos}[job["step"]](job)
+    {"features": find_features, "pairs": match_pairs, "rig": configure_rig, "map": map_photos}[job["step"]](job)
 
 
 def _end_with_parent() -> None:
@@ -95,6 +95,21 @@ def _sensor(values: dict[str, Any]) -> pycolmap.RigConfigCamera:
     if not reference:
         sensor.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
     return sensor
+
+
+def configure_rig(job: dict[str, Any]) -> None:
+    """Make photos of one moment a frame of a rig.
+
+    Keys: database, prefixes (of the images' names by camera, the reference first), model (a folder of placed images,
+    whose mean poses are the rig's).
+    """
+    sensors = [
+        pycolmap.RigConfigCamera(ref_sensor=index == 0, image_prefix=prefix)
+        for index, prefix in enumerate(job["prefixes"])
+    ]
+    placed = pycolmap.Reconstruction(job["model"])
+    with pycolmap.Database.open(job["database"]) as database:
+        pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=sensors)], database, placed)
 
 
 def match_pairs(job: dict[str, Any]) -> None:
