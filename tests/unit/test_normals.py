@@ -146,7 +146,7 @@ def trained(
 @pytest.mark.parametrize(("hierarchy", "levels"), [("laplacian", 1), ("nested", 2), ("laplacian", 2)])
 def test_the_surface_of_a_wall_turns_to_its_normals(tmp_path: Path, hierarchy: str, levels: int) -> None:
     scene = wall_scene((0.0,) * 3)
-    settings = TrainSettings(iterations=900, hierarchy=hierarchy, levels=levels, exposure="off")
+    settings = TrainSettings(iterations=900, hierarchy=hierarchy, levels=levels, appearance="none")
     angles, errors, true = {}, {}, wall_depth(scene)
     for name, normals in (("with", wall_normals(scene)), ("without", {})):
         archive = trained(tmp_path / name, scene, settings, normals)

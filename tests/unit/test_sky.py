@@ -115,7 +115,7 @@ def opacity_of_sky(archive: RunArchive, level: int, views: Sequence[View]) -> fl
 @pytest.mark.parametrize(("hierarchy", "levels"), [("laplacian", 1), ("nested", 2), ("laplacian", 2)])
 def test_sky_is_transparent_in_every_level_and_the_rest_as_good(tmp_path: Path, hierarchy: str, levels: int) -> None:
     scene = town()
-    settings = TrainSettings(iterations=1200, hierarchy=hierarchy, levels=levels, exposure="off")
+    settings = TrainSettings(iterations=1200, hierarchy=hierarchy, levels=levels, appearance="none")
     quality = {}
     for name, given in (("with", scene), ("without", without_sky(scene))):
         archive = train(tmp_path / name, given, settings)
@@ -130,7 +130,7 @@ def test_sky_is_transparent_in_every_level_and_the_rest_as_good(tmp_path: Path, 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])
 def test_a_stopped_run_continues_to_the_same_bits(tmp_path: Path, hierarchy: str) -> None:
-    scene, settings = town(), TrainSettings(iterations=60, hierarchy=hierarchy, exposure="off")
+    scene, settings = town(), TrainSettings(iterations=60, hierarchy=hierarchy, appearance="none")
     whole = train(tmp_path / "whole", scene, settings)
     for stop_at in ((1, 15), (0, 28)):  # the second while a base is trained jointly
         folder = tmp_path / f"stopped_{stop_at[0]}"
@@ -143,7 +143,7 @@ def test_finished_fields_stay_transparent_while_they_are_trained_jointly(tmp_pat
     scene, opacities = town(), []
     for joint in (0.0, 0.3):
         settings = TrainSettings(
-            iterations=1200, joint=joint, exposure="off", densification=Densification(strategy="mcmc")
+            iterations=1200, joint=joint, appearance="none", densification=Densification(strategy="mcmc")
         )
         opacities.append(opacity_of_sky(train(tmp_path / str(joint), scene, settings), 1, scene.train))
     assert opacities[1] < opacities[0]  # 0.14 and 0.24 seen; without the base's own loss it grows to 0.35
@@ -214,7 +214,7 @@ def test_photos_as_masks_of_their_sky_are_refused(photos: Path) -> None:
 
 def test_train_keeps_the_choice_and_the_sky_is_not_measured(photos: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    call = ["train", str(photos), "-o", str(out), "--iterations", "40", "--eval", "--exposure", "off"]
+    call = ["train", str(photos), "-o", str(out), "--iterations", "40", "--eval", "--appearance", "none"]
     result = CliRunner().invoke(app, [*call, "--sky", "sky"])
     assert result.exit_code == 0, result.output
     assert "sky (sky): 5 of 6 photos have a mask, 26% of their pixels are sky" in result.output
