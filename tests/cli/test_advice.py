@@ -34,8 +34,8 @@ method = "bare"
 """
 OF_OTHER_PROGRAMS = {
     "--blur_up", "--ray_jitter", "--train_test_exp", "--use_train_speedup", "--white_background",  # of scripts
-    "--batch_size", "--camera_model", "--data_type",
-    "--create-dirs", "--force-reinstall",  # of curl and pip
+    "--batch_size", "--camera_model", "--data_type", "--depths",
+    "--create-dirs", "--force-reinstall", "--standalone",  # of curl, pip and torchrun
 }  # fmt: skip
 CLIP = "render {run} --trajectory orbit --frames 2"
 ADVICE = [

@@ -171,7 +171,8 @@ def test_losses_that_are_read_together_are_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_once = train(tmp_path / "a", scene, SETTINGS)
-    monkeypatch.setattr(StageRun, "_losses_at_once", 7)
+    monkeypatch.setattr(StageRun, "_reads_late", True)
+    monkeypatch.setattr("lapgs_plugin.training.stage.LOSSES_READ_EVERY", 7)
     later = train(tmp_path / "b", scene, SETTINGS)
     assert losses(later) == losses(at_once)
     assert plys(later) == plys(at_once)
