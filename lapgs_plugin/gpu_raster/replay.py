@@ -189,19 +189,24 @@ class Frame:
 class _Recording(Generic[T]):
     """Hold the launches of a function that always reads and writes the same memory.
 
+    Beside a graph the function is not kept: it is a frame's, which would live until Python looks for cycles.
+
+    Args:
+        launches: their graph, or the function if they cannot be recorded.
+
     Attributes:
         results: of the function; their numbers are those of the last replay.
     """
 
-    def __init__(self, function: Callable[[], T], graph: torch.cuda.CUDAGraph | None, results: T) -> None:
-        self._function, self._graph, self.results = function, graph, results
+    def __init__(self, launches: torch.cuda.CUDAGraph | Callable[[], T], results: T) -> None:
+        self._launches, self.results = launches, results
 
     def replay(self) -> T:
         """Launch all again."""
-        if self._graph is None:
-            self.results = self._function()
+        if isinstance(self._launches, torch.cuda.CUDAGraph):
+            self._launches.replay()
         else:
-            self._graph.replay()
+            self.results = self._launches()
         return self.results
 
 
@@ -227,5 +232,5 @@ class _Recorder:
                     graph.capture_end()
         except RuntimeError as error:
             _broken.extend((graph, self._stream, error))
-            return _Recording(function, None, function())
-        return _Recording(function, graph, results)
+            return _Recording(function, function())
+        return _Recording(graph, results)
