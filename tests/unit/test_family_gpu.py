@@ -290,10 +290,10 @@ assert len(replay._frames._by_kind) == 1
 assert not replay._broken, replay._broken
 # A frame that another one replaces gives its memory back at once, not when Python looks for cycles.
 gc.disable()
-replay.LEAST_GAUSSIANS = 1
+replay.MOST_ROOM = 1.1
 replaced = [weakref.ref(frame) for frame in replay._frames._by_kind.values()]
 for i in range(replay.REPEATED + 1):
-    differentiate(render(of(5_000), True))
+    check("other frame", differentiate(render(of(17_000), True)), expected[17_000])
 assert len(replay._frames._by_kind) == 1
 assert [frame() for frame in replaced] == [None]
 """

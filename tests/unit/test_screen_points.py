@@ -51,6 +51,8 @@ def test_gradients_are_the_same(load_module: Callable[[str], ModuleType], argume
     assert len(addresses) == 2, "zeros are kept as long as the model keeps its size"
     with torch.no_grad():
         assert not ours(means)[0].requires_grad
+    with torch.inference_mode(), torch.enable_grad():
+        assert ours(torch.rand(9, 3))[0].shape == (9, 4)
 
 
 def test_renders_before_one_backward_pass_have_gradients_of_their_own(load_module: Callable[[str], ModuleType]) -> None:
