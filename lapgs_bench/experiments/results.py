@@ -82,6 +82,7 @@ class Results:
         return f"variant-{self.variants.index(variant) % len(VARIANT_COLORS)}"
 
     def title(self, scene: str, backbone: str) -> str:
+        """Return the name of a scene, with the backbone if there are several."""
         several = len({row["backbone"] for row in self.rows}) > 1
         return f"{scene}, {backbone}" if several else scene
 

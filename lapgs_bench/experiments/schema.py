@@ -195,7 +195,7 @@ class Figure(_StrictModel):
     """Check one `[[figures]]` table: an image that is drawn of the results.
 
     Attributes:
-        kind: what it shows, a name in `figures.KINDS`.
+        kind: what it shows.
         scenes: scenes that it shows; empty means all.
         view: held-out view of `crops`; by default the one whose PSNR is the median.
     """
@@ -205,6 +205,12 @@ class Figure(_StrictModel):
     ]
     scenes: list[str] = []
     view: str | None = Field(None, pattern=LINE)
+
+    def images(self, scenes: Sequence[str]) -> dict[str, list[str]]:
+        """Return the scenes of each of its images, by the image's name: one of all scenes, or one for each."""
+        if self.kind in ("seconds_over_gaussians", "peak_memory"):
+            return {self.kind: list(scenes)}
+        return {f"{self.kind}-{scene}": [scene] for scene in scenes}
 
     @model_validator(mode="after")
     def _view_of_crops(self) -> Figure:
@@ -244,6 +250,10 @@ class Experiment(_StrictModel):
             yield f"scenes: scene {twice!r} is listed twice; a variant may have its own resolution instead"
         if (seed := _first_duplicate(self.seeds)) is not None:
             yield f"seeds: {seed} is listed twice, which would count its runs twice; expected different seeds"
+        scenes = [name for entry in self.scenes for name in entry.names]
+        drawn = [name for figure in self.figures for name in figure.images(figure.scenes or scenes)]
+        if (twice := _first_duplicate(drawn)) is not None:
+            yield f"figures: two draw the image {twice}; expected one figure of a kind for a scene"
 
     def _unknown_backbones(self) -> Iterator[str]:
         for number, variant in enumerate(self.variants):

@@ -25,7 +25,7 @@ from lapgs_plugin.ops import (
     regularization,
     upsample,
 )
-from lapgs_plugin.ops.adam import tensorwise
+from lapgs_plugin.ops.adam import multi_tensor
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
@@ -212,14 +212,14 @@ def _checkout_adam_versions(gaussians: int, device: torch.device) -> Versions:
 
     def ours(parameters: list[torch.nn.Parameter]) -> Callable[[], object]:
         optimizer = make(parameters)
-        tensorwise.fuse_steps(optimizer)
+        multi_tensor.fuse_steps(optimizer)
         return optimizer.step
 
     versions = {
         TORCH: version(lambda parameters: make(parameters).step),
         "its fused Adam": version(lambda parameters: make(parameters, fused=True).step),
     }
-    if tensorwise.triton_works():
+    if multi_tensor.triton_works():
         versions["Triton"] = version(ours)
     return versions
 

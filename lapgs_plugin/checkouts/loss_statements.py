@@ -61,8 +61,8 @@ class LossStatements(Change):
     """
 
     def __init__(self, function: ast.FunctionDef) -> None:
-        names = (node for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load))
-        self._loads = Counter(node.id for node in names)
+        names = (node for node in ast.walk(function) if isinstance(node, ast.Name))
+        self._uses = Counter(node.id for node in names if not isinstance(node.ctx, ast.Store))
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
         """Return the statement, or a call of `BACKWARD`."""
@@ -101,7 +101,7 @@ class LossStatements(Change):
         if l1 is None or ssim is None or terms.keys() != loss.variables or l1.images != ssim.images:
             return None
         names = {node.id for node in ast.walk(loss.weight) if isinstance(node, ast.Name)}
-        is_read = isinstance(loss.ssim, ast.Name) and self._loads[loss.ssim.id] > 1  # SSIM by itself is unknown then
+        is_read = isinstance(loss.ssim, ast.Name) and self._uses[loss.ssim.id] > 1  # it has no value then
         if is_read or loss.variables & {*l1.images, *names}:
             return None
         images = [ast.Name(image, ast.Load()) for image in l1.images]

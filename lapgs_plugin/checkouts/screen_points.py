@@ -16,6 +16,8 @@ POINTS = "_lapgs_screen_points"
 """Name of the function that makes the tensor, called with PyTorch's function of zeros and its arguments."""
 HARMLESS = {"grad", "requires_grad", "retain_grad"}
 """Attributes of the tensor that do not change it."""
+OPTIONS = {"requires_grad", "dtype", "device"}
+"""Keyword arguments by which renderers ask for it; `input=` would be a tensor that is kept."""
 
 
 class ScreenPoints(Change):
@@ -42,8 +44,13 @@ class ScreenPoints(Change):
                     ast.Add(),
                     ast.Constant(0),
                 ),
-            ) if name not in self._changed and "requires_grad=True" in map(ast.unparse, keywords):
+            ) if name not in self._changed and _are_plain(keywords):
                 make.func, make.args = ast.copy_location(ast.Name(POINTS, ast.Load()), zeros), [zeros, *args]
                 node.value = make
                 self.changes += 1
         return node
+
+
+def _are_plain(keywords: list[ast.keyword]) -> bool:
+    """Return whether they ask for gradients, and for nothing but `OPTIONS`."""
+    return {k.arg for k in keywords} <= OPTIONS and "requires_grad=True" in map(ast.unparse, keywords)

@@ -39,7 +39,7 @@ LEAST_GAUSSIANS = 2**14
 MOST_FRAMES = 2
 """Frames that are kept at a time."""
 IDLE = 200
-"""Views of other kinds after which a frame may be dropped for another."""
+"""Views of other kinds after which a frame is dropped when another one is made."""
 HEADROOM = 1.25
 """Room for pairs when a graph is recorded, by what is wanted."""
 MOST_ROOM = 2.0
@@ -64,7 +64,7 @@ class _Frames:
         self._views += 1
         frame = self._by_kind.get(kind)
         if frame is None or not n <= frame.room <= MOST_ROOM * n:
-            room = _room_for(n)
+            frame, room = None, _room_for(n)  # one that is referred to here would keep its memory
             self._unframed[kind, room] += 1
             if self._unframed[kind, room] < REPEATED or not self._make_place(kind):
                 return None
@@ -74,18 +74,15 @@ class _Frames:
         return frame
 
     def _make_place(self, kind: _Kind) -> bool:
-        """Drop the frame of a kind or, if there are too many, one that is idle; return False if none is."""
+        """Drop the frame of a kind and all that are idle; return False if there are too many others."""
         if torch.cuda.get_allocator_backend() != "native":  # others may move a graph's memory
             return False
-        if kind not in self._by_kind:
-            if len(self._by_kind) < MOST_FRAMES:
-                return True
-            kind = min(self._last, key=self._last.__getitem__)
-            if self._views - self._last[kind] < IDLE:
-                return False
-        del self._by_kind[kind], self._last[kind]
-        torch.cuda.empty_cache()  # PyTorch uses memory of graphs for nothing else
-        return True
+        dropped = [other for other, last in self._last.items() if other == kind or self._views - last >= IDLE]
+        for other in dropped:
+            del self._by_kind[other], self._last[other]
+        if dropped:
+            torch.cuda.empty_cache()  # PyTorch uses memory of graphs for nothing else
+        return len(self._by_kind) < MOST_FRAMES
 
 
 _frames = _Frames()
@@ -192,19 +189,24 @@ class Frame:
 class _Recording(Generic[T]):
     """Hold the launches of a function that always reads and writes the same memory.
 
+    Beside a graph the function is not kept: it is a frame's, which would live until Python looks for cycles.
+
+    Args:
+        launches: their graph, or the function if they cannot be recorded.
+
     Attributes:
         results: of the function; their numbers are those of the last replay.
     """
 
-    def __init__(self, function: Callable[[], T], graph: torch.cuda.CUDAGraph | None, results: T) -> None:
-        self._function, self._graph, self.results = function, graph, results
+    def __init__(self, launches: torch.cuda.CUDAGraph | Callable[[], T], results: T) -> None:
+        self._launches, self.results = launches, results
 
     def replay(self) -> T:
         """Launch all again."""
-        if self._graph is None:
-            self.results = self._function()
+        if isinstance(self._launches, torch.cuda.CUDAGraph):
+            self._launches.replay()
         else:
-            self._graph.replay()
+            self.results = self._launches()
         return self.results
 
 
@@ -217,7 +219,7 @@ class _Recorder:
 
     def record(self, function: Callable[[], T]) -> _Recording[T]:
         """Return the launches of a function. If they cannot be recorded, nothing is from now on."""
-        results = function()  # so that all kernels are loaded
+        function()  # so that all kernels are loaded; its results are freed before the graph reserves memory for others
         graph = torch.cuda.CUDAGraph()
         self._stream.wait_stream(torch.cuda.current_stream(self._stream.device))
         try:
@@ -230,5 +232,5 @@ class _Recorder:
                     graph.capture_end()
         except RuntimeError as error:
             _broken.extend((graph, self._stream, error))
-            return _Recording(function, None, results)
-        return _Recording(function, graph, results)
+            return _Recording(function, function())
+        return _Recording(graph, results)

@@ -173,6 +173,7 @@ def edge_squares(photo: Tensor, count: int) -> list[tuple[int, int, int]]:
 
 
 def cut_out(layers: Sequence[Layer], square: tuple[int, int, int]) -> Cutout:
+    """Return the part of each layer in a square of `edge_squares`, in its own pixels."""
     left, top, side = square
     height, width = layers[0].image.shape[-2:]
     pictures = []
@@ -185,6 +186,7 @@ def cut_out(layers: Sequence[Layer], square: tuple[int, int, int]) -> Cutout:
 
 
 def shrink(layer: Layer) -> Picture:
+    """Return a layer as a picture with sides of at most `IMAGE_SIDE` pixels."""
     height, width = layer.image.shape[-2:]
     scale = min(1.0, IMAGE_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))

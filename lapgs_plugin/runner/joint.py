@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.ops.adam import ADAM_EPS
-from lapgs_plugin.ops.adam.tensorwise import fuse_steps
+from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.runner.context import FinishedStage, TrainingRun
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews

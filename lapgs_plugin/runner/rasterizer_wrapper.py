@@ -224,7 +224,7 @@ class RasterizerWrapper:
             make: PyTorch's function of zeros.
             args, kwargs: of it.
         """
-        if not torch.is_grad_enabled():
+        if not torch.is_grad_enabled() or torch.is_inference_mode_enabled():
             return make(*args, **kwargs) + 0
         like = [(a.shape, a.dtype, a.device) if isinstance(a, Tensor) else a for a in args]
         asked = [make, like, kwargs]

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from lapgs_plugin.adapters.base import GROUPS
 from lapgs_plugin.errors import RunFolderError, UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.ops.adam.tensorwise import fuse_steps
+from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.ops.unit_quaternions import unit_quaternions
 from lapgs_plugin.runner.context import StageResult, TrainingRun
 from lapgs_plugin.runner.object_values import fields_of, with_values

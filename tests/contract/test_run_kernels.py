@@ -12,8 +12,8 @@ import torch
 from lapgs_plugin.checkouts.logged_numbers import READ
 from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.ops import photometric_loss
-from lapgs_plugin.ops.adam import tensorwise
-from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam
+from lapgs_plugin.ops.adam import multi_tensor
+from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam
 from lapgs_plugin.ops.masked_updates import update_rows
 from lapgs_plugin.runner import checkout_loss, late_numbers, visible_rows
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
@@ -37,23 +37,23 @@ def test_adam(name: str, kind: str, scene: Path, tmp_path: Path, monkeypatch: py
     """Its class on a CPU, where it steps in PyTorch's operations: density control edits its state as PyTorch's."""
     plain, _ = run_hierarchy(STUBS[name], scene, tmp_path / "plain", *HALF, hierarchy=kind)
     used: set[type] = set()
-    prepare, step = StageModel.prepare_optimizers, TensorwiseAdam.step
+    prepare, step = StageModel.prepare_optimizers, MultiTensorAdam.step
 
     def prepare_and_fuse(model: StageModel, gaussians: Any, inherit: bool) -> None:
         prepare(model, gaussians, inherit)
         for optimizer in model._adapter.optimizers(gaussians):
-            tensorwise.fuse_steps(optimizer)
+            multi_tensor.fuse_steps(optimizer)
 
-    def counted(optimizer: TensorwiseAdam, *args: Any) -> Any:
+    def counted(optimizer: MultiTensorAdam, *args: Any) -> Any:
         used.add(type(optimizer))
         return step(optimizer, *args)
 
     counted.hooked = True  # type: ignore[attr-defined]
-    monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
+    monkeypatch.setattr(multi_tensor, "triton_works", lambda *tensors: not tensors)
     monkeypatch.setattr(StageModel, "prepare_optimizers", prepare_and_fuse)
-    monkeypatch.setattr(TensorwiseAdam, "step", counted)
+    monkeypatch.setattr(MultiTensorAdam, "step", counted)
     ours, _ = run_hierarchy(STUBS[name], scene, tmp_path / "ours", *HALF, hierarchy=kind)
-    assert used == {TensorwiseAdam}
+    assert used == {MultiTensorAdam}
     assert composed_psnr(ours) == pytest.approx(composed_psnr(plain), abs=0.2)  # dB; worst seen 0
 
 

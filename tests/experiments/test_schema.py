@@ -155,6 +155,14 @@ def test_there_is_an_experiment_for_every_table() -> None:
         ('kind = "crops"\nscenes = ["b"]', ("figures.0", "scene 'b' is not in the experiment")),
         ('kind = "crops"\nview = "0.jpg"', ("figures.0", "view is for crops of one scene")),
         ('kind = "edges"\nscenes = ["a"]\nview = "0.jpg"', ("figures.0", "view is for crops of one scene")),
+        (
+            'kind = "crops"\n[[figures]]\nkind = "crops"\nscenes = ["a"]\nview = "0.jpg"',
+            ("two draw the image crops",),
+        ),
+        (
+            'kind = "peak_memory"\nscenes = ["a"]\n[[figures]]\nkind = "peak_memory"',
+            ("two draw the image peak",),
+        ),
         ('kind = "crops"\nscene = ["a"]', ("unknown key figures.0.scene", "did you mean scenes?")),
     ],
 )

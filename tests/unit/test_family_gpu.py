@@ -233,6 +233,9 @@ for key, value in found[0].items():
 """
 
 REPLAYED = """
+import gc
+import weakref
+
 from lapgs_plugin.gpu_raster import replay
 
 whole = random_case(20_000, 160, 90, seed=5, sh_degree=1, background=COLORED, pixels=(0.5, 6.0)).to(torch.float32)
@@ -285,6 +288,14 @@ for key in tiles._rooms:
 check("little room", differentiate(render(whole, True)), expected[20_000])
 assert len(replay._frames._by_kind) == 1
 assert not replay._broken, replay._broken
+# A frame that another one replaces gives its memory back at once, not when Python looks for cycles.
+gc.disable()
+replay.MOST_ROOM = 1.1
+replaced = [weakref.ref(frame) for frame in replay._frames._by_kind.values()]
+for i in range(replay.REPEATED + 1):
+    check("other frame", differentiate(render(of(17_000), True)), expected[17_000])
+assert len(replay._frames._by_kind) == 1
+assert [frame() for frame in replaced] == [None]
 """
 
 needs_triton = pytest.mark.skipif(

@@ -118,6 +118,7 @@ def test_losses_of_the_family(
         (L1, ONE.replace("* (1.0", "* (2.0")),
         (L1, ONE.replace("opt.weight * (1", "W * (1")),
         (L1, BATCHES, SET, "loss = loss + value"),
+        (L1, BATCHES, SET, "del value"),
         (L1, "value = ssim(image, gt.unsqueeze(0))", SET),
         (L1, "if FUSED:", f"    {BATCHES}", "else:", "    value = ssim(gt, image)", SET),
         (L1.replace("l1_loss", "charbonnier"), ONE),

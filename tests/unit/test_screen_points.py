@@ -51,6 +51,19 @@ def test_gradients_are_the_same(load_module: Callable[[str], ModuleType], argume
     assert len(addresses) == 2, "zeros are kept as long as the model keeps its size"
     with torch.no_grad():
         assert not ours(means)[0].requires_grad
+    with torch.inference_mode(), torch.enable_grad():
+        assert ours(torch.rand(9, 3))[0].shape == (9, 4)
+
+
+def test_renders_before_one_backward_pass_have_gradients_of_their_own(load_module: Callable[[str], ModuleType]) -> None:
+    module = load_module(RENDERER.format("len(means), 4").replace("points[:, :2]", "torch.narrow(points, 1, 0, 2)"))
+    gradients = []
+    for render in (RasterizerWrapper(Stages()).renderer(module.render), module.render):
+        views = [render(means) for means in (torch.ones(5, 3), 2 * torch.ones(5, 3))]
+        torch.stack([value for _, value in views]).sum().backward()
+        gradients.append([points.grad for points, _ in views])
+    for ours, theirs in zip(*gradients, strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_zeros_that_were_written_are_made_again(load_module: Callable[[str], ModuleType]) -> None:
@@ -69,6 +82,7 @@ def test_zeros_that_were_written_are_made_again(load_module: Callable[[str], Mod
         ("x = torch.zeros_like(m, requires_grad=True) + 0", 1),
         ("x = torch.zeros_like(m, requires_grad=True)", 0),
         ("x = torch.zeros_like(m) + 0", 0),
+        ("x = torch.zeros_like(input=m, requires_grad=True) + 0", 0),
         ("x = torch.ones_like(m, requires_grad=True) + 0", 0),
         ("x = torch.zeros_like(m, requires_grad=True) + 1", 0),
         ("x = torch.zeros_like(m, requires_grad=True) + 0\n    x[:, 0] = 1", 0),

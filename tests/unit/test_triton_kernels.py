@@ -159,11 +159,11 @@ close(photometric_loss_triton(cut, cut.clone(), 0.2), torch.zeros(()))
 
 from lapgs_plugin.ops import adam, color_transform, densification_statistics, photometric_loss
 from lapgs_plugin.ops import position_noise, regularization
-from lapgs_plugin.ops.adam import rows, tensorwise
+from lapgs_plugin.ops.adam import multi_tensor, rows
 torch.set_default_device(None)
 assert color_transform.triton_works.difference(torch.device(DEVICE)) < 5e-5  # worst seen 2e-5
 assert adam.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 1e-6
-assert tensorwise.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 8e-7
+assert multi_tensor.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 8e-7
 # As many tensors as a fork has, of which one launch takes six; one group has other betas.
 parameters = [torch.nn.Parameter(torch.randn(size, 3).to(DEVICE)) for size in (600, 1, 300, 0, 171, 513, 90, 700)]
 groups = [{"params": [one], "lr": 0.1 * i} for i, one in enumerate(parameters, start=1)]
@@ -171,8 +171,8 @@ groups[2]["betas"] = 0.5, 0.9
 others = [torch.nn.Parameter(one.detach().clone()) for one in parameters]
 optimizer = torch.optim.Adam(groups, eps=1e-15)
 reference = torch.optim.Adam([{**group, "params": [other]} for group, other in zip(groups, others, strict=True)])
-works, tensorwise.triton_works = tensorwise.triton_works, lambda *tensors: True
-tensorwise.fuse_steps(optimizer)
+works, multi_tensor.triton_works = multi_tensor.triton_works, lambda *tensors: True
+multi_tensor.fuse_steps(optimizer)
 for _ in range(3):
     for one, other in zip(parameters, others, strict=True):
         one.grad = other.grad = torch.randn(one.shape).to(DEVICE)
@@ -180,7 +180,7 @@ for _ in range(3):
     reference.step()
 for one, other in zip(parameters, others, strict=True):
     close(one, other, 1e-5)  # numbers to 4, moved by 2
-tensorwise.triton_works = works
+multi_tensor.triton_works = works
 assert rows.triton_works.difference(torch.device(DEVICE)) < 1e-5  # worst seen 2e-7
 assert densification_statistics.triton_works.difference(torch.device(DEVICE)) < 1e-5
 assert photometric_loss.triton_works.difference(torch.device(DEVICE)) < 1e-3  # worst seen 3e-5

@@ -47,13 +47,14 @@ class Methods:
 
     @classmethod
     def of(cls, experiment: Experiment, results: Results) -> Methods:
-        asked = {(row["backbone"], row["variant"]) for row in results.rows}
-        several = len({backbone for backbone, _ in asked}) > 1
+        """Name the methods that have results."""
+        measured = {(row["backbone"], row["variant"]) for row in results.rows}
+        several = len({backbone for backbone, _ in measured}) > 1
         labels = {
             (name, variant.name): f"{backbone.title or name}: {variant.name}" if several else variant.name
             for name, backbone in experiment.backbones.items()
             for variant in experiment.variants
-            if (name, variant.name) in asked
+            if (name, variant.name) in measured
         }
         return cls(labels)
 

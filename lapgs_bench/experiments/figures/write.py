@@ -47,18 +47,18 @@ def _images(experiment: Experiment, figure: Figure, results: Results) -> Iterato
     """Yield the images of a figure: a name, and a function that draws the SVG."""
     measured = list(dict.fromkeys(row["scene"] for row in results.rows))
     scenes = [scene for scene in measured if scene in (figure.scenes or measured)]
-    if figure.kind == "seconds_over_gaussians":
-        yield figure.kind, lambda: draw_time_against_gaussians(experiment, results, scenes)
-    elif figure.kind == "peak_memory":
-        yield figure.kind, lambda: draw_peak_memory(experiment, results, scenes)
-    else:
-        for scene in scenes:
-            yield f"{figure.kind}-{scene}", _of_scene(experiment, figure, results, scene)
+    for name, shown in figure.images(scenes).items():
+        yield name, _drawing(experiment, figure, results, shown)
 
 
-def _of_scene(experiment: Experiment, figure: Figure, results: Results, scene: str) -> Callable[[], str]:
-    """Return what draws the image of one scene."""
+def _drawing(experiment: Experiment, figure: Figure, results: Results, scenes: Sequence[str]) -> Callable[[], str]:
+    """Return what draws an image of these scenes; most images are of one."""
+    scene = next(iter(scenes), "")
     match figure.kind:
+        case "seconds_over_gaussians":
+            return lambda: draw_time_against_gaussians(experiment, results, scenes)
+        case "peak_memory":
+            return lambda: draw_peak_memory(experiment, results, scenes)
         case "psnr_over_seconds":
             advice = "give its runs options = { test_every = 1000 }"
             return lambda: draw_training(

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from lapgs_plugin.ops.adam import ADAM_EPS
-from lapgs_plugin.ops.adam.tensorwise import fuse_steps
+from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.runner.splats.signed import CoarserLevels, FinishedField
 
 COLORS = ("sh0", "shN")

@@ -17,7 +17,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats,
 from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.cameras import level_intrinsics
 from lapgs_plugin.hierarchy.plan import Stage, level_size
-from lapgs_plugin.ops.adam.tensorwise import fuse_steps
+from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.splats.joint import follow, trainable
 from lapgs_plugin.runner.splats.run import SplatRun, write_cameras

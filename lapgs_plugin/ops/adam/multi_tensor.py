@@ -1,4 +1,4 @@
-"""Step the tensors of a script's own `torch.optim.Adam` in one of our kernels.
+"""Step the tensors of a script's own `torch.optim.Adam` in one launch of our kernel.
 
 PyTorch's fused Adam has one for each group of parameters, because it takes one rate. Its blocks take so many numbers
 that a field's positions leave most of a GPU idle, and its Python takes as long as a small render.
@@ -17,7 +17,7 @@ from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
-class TensorwiseAdam(torch.optim.Adam):
+class MultiTensorAdam(torch.optim.Adam):
     """Step as `torch.optim.Adam` does, with its groups, state and hooks; results differ by rounding.
 
     `fuse_steps` makes optimizers of this class. It supports none of the options of `torch.optim.Adam`.
@@ -105,7 +105,7 @@ def fuse_steps(optimizer: torch.optim.Optimizer) -> None:
                 state["step"] = torch.as_tensor(state["step"]).to("cpu" if ours else parameter.device)
                 state.update({name: state[name].contiguous() for name in ("exp_avg", "exp_avg_sq") if ours})
     if ours:
-        optimizer.__class__ = TensorwiseAdam
+        optimizer.__class__ = MultiTensorAdam
 
 
 def _is_plain(group: dict[str, Any]) -> bool:

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.adam import tensorwise
-from lapgs_plugin.ops.adam.tensorwise import TensorwiseAdam, fuse_steps
+from lapgs_plugin.ops.adam import multi_tensor
+from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam, fuse_steps
 from tests.devices import DEVICES
 
 
@@ -20,7 +20,7 @@ from tests.devices import DEVICES
 def works(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the kernel pass its check without a GPU; tensors on a CPU are stepped in PyTorch's operations anyway."""
     if not torch.cuda.is_available():
-        monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: not tensors)
+        monkeypatch.setattr(multi_tensor, "triton_works", lambda *tensors: not tensors)
 
 
 def new_adam(device: str, **options: Any) -> tuple[list[torch.nn.Parameter], torch.optim.Adam]:
@@ -56,7 +56,7 @@ def test_steps_are_those_of_pytorch(device: str, betas: tuple[float, float], wor
     (stepped, ours), (expected, theirs) = new_adam(device, betas=betas), new_adam(device, betas=betas)
     step(stepped, ours, 0), step(expected, theirs, 0)  # so that there is state to take over
     fuse_steps(ours)
-    assert type(ours) is TensorwiseAdam
+    assert type(ours) is MultiTensorAdam
     assert all(tensor.is_contiguous() for one in stepped for tensor in (one, *ours.state[one].values()))
     for seed in range(1, 5):
         step(stepped, ours, seed)
@@ -150,7 +150,7 @@ def test_what_is_left_alone(make: Callable[[Tensor], torch.optim.Optimizer], wor
 
 
 def test_without_the_kernel_it_is_pytorchs_fused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tensorwise, "triton_works", lambda *tensors: False)
+    monkeypatch.setattr(multi_tensor, "triton_works", lambda *tensors: False)
     (stepped, ours), (expected, theirs) = new_adam("cpu"), new_adam("cpu")
     for seed in range(3):
         step(stepped, ours, seed)
