@@ -53,7 +53,7 @@ class Camera:
 
     def local(self, points: Tensor) -> Tensor:
         """Return points (n, 3) of the world in the camera's axes, with their type and device; the last is the depth."""
-        pose = self.world_to_camera.to(points)
+        pose = self.world_to_camera.to(points, non_blocking=points.is_cuda)  # in a step, which must not wait
         return points @ pose[:3, :3].T + pose[:3, 3]
 
     def resized(self, width: int, height: int) -> Camera:

@@ -211,7 +211,7 @@ def require_color(background: Tensor) -> None:
 def render_values(rasterizer: Rasterizer, field: GaussianField, camera: Camera, values: Tensor) -> Tensor:
     """Return values (n, 3) of the Gaussians blended as colours are, over zero: (3, height, width), differentiable."""
     shown = replace(field, sh=(values / SH_C0)[:, None], signed=True)
-    return rasterizer.render_image(shown, camera, background=torch.zeros(3).to(values), sh_degree=0)
+    return rasterizer.render_image(shown, camera, background=values.new_zeros(3), sh_degree=0)
 
 
 def render_depths(rasterizer: Rasterizer, field: GaussianField, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,14 @@ from lapgs_plugin.runner.stage_rendering import Captured, OnCall
 from lapgs_plugin.scenes.depth import DepthTargets, depth_size, load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import NONE, stem_of
 from lapgs_plugin.scenes.scene import View, load_scene
-from lapgs_plugin.stages.geometry import EVERY, depth_loss, depth_weight, mean_inverse_depth, resized_blend
+from lapgs_plugin.stages.geometry import (
+    EVERY,
+    depth_loss,
+    depth_scale,
+    depth_weight,
+    mean_inverse_depth,
+    resized_blend,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +110,7 @@ class CheckoutDepth:
             stage: of the plan, no residual.
             sizes: (width, height) of the stage's views by key.
         """
-        present, targets = {*self.targets.names}, dict[str, Tensor]()
+        present, targets = {*self.targets.names}, dict[str, tuple[Tensor, Tensor]]()  # with scales
 
         def on_call(
             key: str, image: Tensor, rasterizer: Callable[..., Any], inputs: Mapping[str, Any], settings: Any
@@ -113,9 +120,11 @@ class CheckoutDepth:
             if iteration % EVERY or self.hooks.paused or self.names.get(key) not in present or key not in sizes:
                 return image
             if key not in targets:
-                targets[key] = self.targets.inverse(self.names[key], depth_size(sizes[key])).to(self.device)
-            blend = resized_blend(blended_inverse_depths(rasterizer, inputs, settings), targets[key])
-            loss = depth_loss(mean_inverse_depth(*blend), targets[key])
+                own = self.targets.inverse(self.names[key], depth_size(sizes[key])).to(self.device)
+                targets[key] = own, depth_scale(own)
+            target, scale = targets[key]
+            blend = resized_blend(blended_inverse_depths(rasterizer, inputs, settings), target)
+            loss = depth_loss(mean_inverse_depth(*blend), target, scale)
             return with_term(image, EVERY * depth_weight(plan, stage, iteration) * loss)
 
         return on_call

@@ -31,7 +31,7 @@ FIRST_WEIGHT, LAST_WEIGHT = 1.0, 0.01
 LEAST_OPACITY = 0.01
 """Opacity of a pixel below which its loss fades out."""
 EVERY = 2
-"""Iterations from one with these losses to the next, which count as often: their render costs as much as an image."""
+"""Turns from one with these losses to the next, which count as often: their render costs as much as an image."""
 
 NORMAL_WEIGHT = 0.05
 """Weight of the normal loss, that of 2DGS for normals of depths."""
@@ -59,14 +59,24 @@ def resized_blend(blend: tuple[Tensor, Tensor], target: Tensor) -> tuple[Tensor,
     return both[0], both[1]
 
 
-def depth_loss(inverse: Tensor, target: Tensor) -> Tensor:
+def depth_scale(target: Tensor) -> Tensor:
+    """Return a scalar: the inverse of a target's median times its number of pixels with depth; 0 without any depth.
+
+    The median sorts all pixels and waits for a GPU.
+    """
+    typical = target.nanmedian()
+    return torch.where(typical > 0.0, 1.0 / ((~target.isnan()).sum() * typical), 0.0)
+
+
+def depth_loss(inverse: Tensor, target: Tensor, scale: Tensor) -> Tensor:
     """Return the mean absolute difference of inverse depths (h, w) over the target's median, where that is no NaN.
 
-    It is 0 if the target is 0 or NaN everywhere.
+    Args:
+        inverse, target: (h, w).
+        scale: `depth_scale` of the target.
     """
-    valid, typical = ~target.isnan(), target.nanmedian()
-    share = torch.where(typical > 0.0, 1.0 / (valid.sum() * typical), 0.0)
-    return torch.where(valid, inverse - torch.where(valid, target, 0.0), 0.0).abs().sum() * share
+    valid = ~target.isnan()
+    return torch.where(valid, inverse - torch.where(valid, target, 0.0), 0.0).abs().sum() * scale
 
 
 def sky_loss(opacity: Tensor, sky: Tensor) -> Tensor:
@@ -85,9 +95,8 @@ def normals_of(inverse: Tensor, camera: Camera) -> Tensor:
     """
     across = (inverse[1:-1, 2:] - inverse[1:-1, :-2]) * (camera.fx / 2)
     down = (inverse[2:, 1:-1] - inverse[:-2, 1:-1]) * (camera.fy / 2)
-    rows, columns = torch.meshgrid(
-        torch.arange(1, camera.height - 1).to(inverse), torch.arange(1, camera.width - 1).to(inverse), indexing="ij"
-    )
+    inner = (torch.arange(1, side - 1, dtype=inverse.dtype, device=inverse.device) for side in camera.size[::-1])
+    rows, columns = torch.meshgrid(*inner, indexing="ij")
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     along = inverse[1:-1, 1:-1] - x * across - y * down
     return -F.normalize(torch.stack([across, down, along]), dim=0)
@@ -125,11 +134,15 @@ class StageGeometry:
     depths: Mapping[str, Tensor]
     normals: Mapping[str, Tensor]
     skies: Mapping[str, Tensor]
+    _scales: dict[str, Tensor] = field(init=False, repr=False)  # of `depths`
     _cameras: dict[str, tuple[Camera, Camera]] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self._scales = {name: depth_scale(depth) for name, depth in self.depths.items()}
 
     def loss(
         self,
-        iterations: Sequence[int],
+        turns: Sequence[int],
         names: Sequence[str],
         cameras: Sequence[Camera],
         gaussians: GaussianField,
@@ -138,7 +151,7 @@ class StageGeometry:
         """Return the weighted mean loss of some views; None if it is due in none of them.
 
         Args:
-            iterations: of the stage that train the views.
+            turns: of the views, whose losses are due at multiples of `EVERY`.
             names: of the views.
             cameras: theirs at the level's size.
             gaussians: the field.
@@ -146,8 +159,8 @@ class StageGeometry:
         """
         losses = [
             self._of_view(name, self._camera(name, camera), gaussians, depth_weight)
-            for iteration, name, camera in zip(iterations, names, cameras, strict=True)
-            if iteration % EVERY == 0 and any(name in those for those in (self.depths, self.normals, self.skies))
+            for turn, name, camera in zip(turns, names, cameras, strict=True)
+            if turn % EVERY == 0 and any(name in those for those in (self.depths, self.normals, self.skies))
         ]
         return EVERY * torch.stack(losses).sum() / len(names) if losses else None
 
@@ -156,7 +169,7 @@ class StageGeometry:
         blended, opacity = render_inverse_depths(self.rasterizer, gaussians, camera)
         inverse, losses = mean_inverse_depth(blended, opacity), [blended.new_zeros(())]
         if (depth := self.depths.get(name)) is not None:
-            losses.append(depth_weight * depth_loss(inverse, depth))
+            losses.append(depth_weight * depth_loss(inverse, depth, self._scales[name]))
         if (normals := self.normals.get(name)) is not None:
             losses.append(NORMAL_WEIGHT * normal_loss(inverse, opacity, normals, camera))
         if (sky := self.skies.get(name)) is not None:

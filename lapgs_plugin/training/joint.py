@@ -56,12 +56,12 @@ class JointFields:
             return self.rasterizer.render_image(field, cameras[0], background=background)
         return self.rasterizer.render_batch(model.field, cameras, background=background, with_geometry=False).image
 
-    def sky_losses(self, iterations: Sequence[int], names: Sequence[str]) -> list[Tensor]:
+    def sky_losses(self, turns: Sequence[int], names: Sequence[str]) -> list[Tensor]:
         """Return the weighted losses of the fields by the sky of some views; arguments as `StageGeometry.loss`."""
         losses = []
         for level, sky in self.skies.items():
             cameras = [self._camera(name, level) for name in names]
-            losses.append(sky.loss(iterations, names, cameras, self.models[level].field, 0.0))
+            losses.append(sky.loss(turns, names, cameras, self.models[level].field, 0.0))
         return [loss for loss in losses if loss is not None]
 
     def _camera(self, name: str, level: int) -> Camera:

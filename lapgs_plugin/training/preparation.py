@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
+from zlib import crc32
 
 import torch
 
@@ -310,7 +312,7 @@ def _require_views(ranks: Ranks, photos: int) -> None:
 def _require_same_run(ranks: Ranks, scene: Scene, settings: TrainSettings) -> None:
     """Refuse ranks whose scene or settings are not those of rank 0."""
     names = [(view.name, view.camera.size) for view in (*scene.train, *scene.test)]
-    points = len(scene.points), float(scene.points.double().sum())
+    points = len(scene.points), crc32(scene.points.numpy().tobytes())
     require_same(ranks, {"photos": names, "points": points, "settings": settings.for_manifest()})
 
 
@@ -345,10 +347,10 @@ def _say_about_photos(run: PreparedRun, say: Say) -> None:
     """Say the share of their pixels inside masks and in the sky, and whether a CPU takes hours for so many."""
     views, scene = (*run.scene.train, *run.aside, *run.scene.test), run.archive.manifest.scene
     if run.ranks.leads and scene.sky != NONE:
-        skies = [sky for view in views if (sky := view.sky) is not None]
+        shares = [share_inside([sky]) for view in views if (sky := view.sky) is not None]
         say(
-            f"sky ({scene.sky}): {len(skies)} of {len(views)} photos have a mask, {share_inside(skies):.0%} of their "
-            "pixels are sky"
+            f"sky ({scene.sky}): {len(shares)} of {len(views)} photos have a mask, {fmean(shares):.0%} of their pixels "
+            "are sky"
         )
     if run.ranks.leads and any(view.masked for view in views):
         share, masks = share_inside(view.mask for view in views), scene.masks if scene.sky == NONE else "and sky"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -133,6 +135,15 @@ class PreparedRun(StagedRun):
     def cache_folder(self) -> Path:
         """See `StagedRun`; each rank has its own."""
         return self.archive.path(CACHE, f"rank_{self.ranks.rank}") if self.ranks.size > 1 else super().cache_folder
+
+    @contextmanager
+    def image_cache(self) -> Iterator[None]:
+        """See `StagedRun`; rank 0 removes the images of all ranks of a killed run, which may have had more."""
+        if self.ranks.leads:
+            shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
+        self.ranks.wait()
+        with super().image_cache():
+            yield
 
     def steps_of(self, stage: Stage) -> WholeSteps:
         """Return which views the steps of a stage have, and which of them this process renders."""

@@ -451,7 +451,8 @@ class StageRun:
         self._breakdown.mark("forward")
         gaussians = self.model.field
         share = self._dropout * self.schedule.progress_at(last)
-        shown = thinned(gaussians, share, self._steps.generator(last, gaussians.means.device))
+        draws = self._steps.generator(last, gaussians.means.device) if share else None
+        shown = thinned(gaussians, share, draws)
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
         self._breakdown.mark("loss")
@@ -478,11 +479,12 @@ class StageRun:
     ) -> Tensor:
         """Return the mean loss of some views with those of their depth, normals and sky, if any."""
         names, cameras = [view.name for view in views], [view.camera for view in views]
+        turns = [self._steps.turn(iteration) for iteration in iterations]
         if self.geometry is not None:
             weight = depth_weight(self.prepared.plan, self.stage, iterations[-1])
-            own = self.geometry.loss(iterations, names, cameras, shown, weight)
+            own = self.geometry.loss(turns, names, cameras, shown, weight)
             loss = loss if own is None else loss + own
-        coarser = [] if self.joint is None else self.joint.sky_losses(iterations, names)
+        coarser = [] if self.joint is None else self.joint.sky_losses(turns, names)
         return sum(coarser, loss)
 
     def _hooked_loss(self, iterations: Sequence[int], names: Sequence[str], cameras: Sequence[Camera]) -> LossOf:

@@ -37,7 +37,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.world import build_world
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.stages.geometry import StageGeometry, depth_loss, depth_weight, mean_inverse_depth
+from lapgs_plugin.stages.geometry import StageGeometry, depth_loss, depth_scale, depth_weight, mean_inverse_depth
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.settings import TrainSettings
 from lapgs_plugin.training.trainer import Trainer
@@ -261,7 +261,8 @@ def depth_gradients(rasterizer: Rasterizer, device: str, dtype: torch.dtype) -> 
     target = (0.2 + 0.1 * torch.rand(camera.height, camera.width, generator=torch.Generator().manual_seed(3))).to(dtype)
     target[::3] = torch.nan
     inverse = mean_inverse_depth(*render_inverse_depths(rasterizer, field.with_parameters(leaves), camera))
-    depth_loss(inverse, target.to(device)).backward()  # type: ignore[no-untyped-call]  # torch's
+    target = target.to(device)
+    depth_loss(inverse, target, depth_scale(target)).backward()  # type: ignore[no-untyped-call]  # torch's
     return {name: leaf.grad.cpu().double() for name, leaf in leaves.items() if name != "sh" and leaf.grad is not None}
 
 

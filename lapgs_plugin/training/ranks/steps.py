@@ -38,6 +38,10 @@ class WholeSteps:
         """Return the index of the view that an iteration, from 1, trains."""
         return view_index(iteration, self.views, self.seed, self.level)
 
+    def turn(self, iteration: int) -> int:
+        """Return a number that decides whether what is due in every so many iterations is due in this one."""
+        return iteration
+
     def own(self, views: Sequence[int]) -> list[list[int]]:
         """Return the parts of some views that are summed one after the other here, each by itself."""
         return [list(views)]
@@ -86,6 +90,14 @@ class SharedSteps(WholeSteps):
         epoch, position = divmod(iteration - 1, self.views)
         return epoch_order(self.views, self.seed, self.level, epoch, self.shards)[position]
 
+    def turn(self, iteration: int) -> int:
+        """See `WholeSteps`. Iterations themselves would always give the same shards, and ranks, their turn.
+
+        The parity of a place's bits differs between the views of a rank in a step, and, with the epoch, of a view.
+        """
+        epoch, position = divmod(iteration - 1, self.views)
+        return epoch + position.bit_count()
+
     def own(self, views: Sequence[int]) -> list[list[int]]:
         return self._by_shard(views, views)
 
@@ -94,11 +106,12 @@ class SharedSteps(WholeSteps):
 
     def _by_shard(self, items: Sequence[int], views: Sequence[int]) -> list[list[int]]:
         """Return those items whose views this rank owns, by the views' shards."""
-        shards = range(self.group.rank, self.shards, self.group.size)
-        parts = [
-            [item for item, view in zip(items, views, strict=True) if view % self.shards == shard] for shard in shards
-        ]
-        return parts if self.exact else [[item for item in items if any(item in part for part in parts)]]
+        rank, size = self.group.rank, self.group.size
+        shards = [view % self.shards for view in views]
+        own = [(item, shard) for item, shard in zip(items, shards, strict=True) if shard % size == rank]
+        if not self.exact:
+            return [[item for item, _ in own]]
+        return [[item for item, shard in own if shard == mine] for mine in range(rank, self.shards, size)]
 
     def total(self, parts: Sequence[Sequence[Tensor] | None], zeros: Callable[[], list[Tensor]]) -> list[Tensor]:
         return self.group.sum(super().total(parts, zeros))
