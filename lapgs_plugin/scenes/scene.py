@@ -264,7 +264,7 @@ def load_scene(
         return View(frame.name, camera, image, *later)
 
     items = list(zip(frames, cameras, strict=True))
-    shown, readers = progress and read, readers_of(camera.size for camera in cameras)
+    shown, readers = progress if read else False, readers_of(camera.size for camera in cameras)
     views = in_threads("Reading images", "images", load, items, most=readers, progress=shown)
     if masks == ALPHA and not any(view.masked for view in views):
         raise UserInputError(
