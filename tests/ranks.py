@@ -1,6 +1,8 @@
 """Small runs that several ranks train, or one process that makes the same sums. As a program this is one of the ranks.
 
-RANK=0 WORLD_SIZE=2 ... python -m tests.ranks FOLDER CASE...
+RANK=0 WORLD_SIZE=2 ... python -m tests.ranks FOLDER WORD...
+
+It trains all cases into the folder, then one whose fields differ, and runs `lapgs` with the words.
 """
 
 from __future__ import annotations
@@ -16,10 +18,12 @@ from typing import Any
 
 import torch
 
+from lapgs_plugin.cli.app import run
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.ranks.archive import open_for
+from lapgs_plugin.training.ranks.equality import RanksDifferError
 from lapgs_plugin.training.ranks.group import Ranks, joined
 from lapgs_plugin.training.settings import Densification, TrainingControl, TrainSettings
 from lapgs_plugin.training.strategies import Gradients, Mcmc, Multiview
@@ -30,7 +34,7 @@ from tests.training_scene import blob_field, ring_scene
 STARTED_ON = 2
 """Ranks that all these runs are started on."""
 DIFFERENT = "different"
-"""In place of a case: ranks whose fields differ."""
+"""Folder of the run of ranks whose fields differ."""
 PHOTOS = 13
 """Training photos, the last of which have shards to themselves in an epoch."""
 
@@ -75,8 +79,8 @@ def train(path: Path, name: str, ranks: Ranks, **decided: Any) -> None:
     make, asked = CASES[name]
     with open_for(ranks, path, lambda kind: kind.create(path, ring_manifest(asked))) as archive:
         control = TrainingControl(test_every=20)
-        run = PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), control, ranks=ranks, **decided)
-        Trainer(run).run()
+        prepared = PreparedRun.of(make(), asked, archive, placed(CpuRasterizer()), control, ranks=ranks, **decided)
+        Trainer(prepared).run()
 
 
 def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Popen[str]]:
@@ -100,14 +104,18 @@ def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Pop
 
 
 def main() -> None:
-    """Train the cases of the command line as one of the ranks, or start each rank from a field of its own."""
+    """Be one of the ranks."""
+    folder, *words = sys.argv[1:]
     ranks = joined()
-    for name in sys.argv[2:]:
-        if name == DIFFERENT:
-            train(Path(sys.argv[1]) / name, "poses", ranks, first_field=blob_field(seed=ranks.rank))
-        else:
-            train(Path(sys.argv[1]) / name, name, ranks)
+    for name in CASES:
+        train(Path(folder) / name, name, ranks)
+    try:
+        train(Path(folder) / DIFFERENT, "poses", ranks, first_field=blob_field(seed=ranks.rank))
+    except RanksDifferError as error:
+        print(error, flush=True)
     ranks.close()
+    sys.argv[1:] = words
+    run()
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ class StartOptions:
         if self.gpus is not None:
             launcher.require_gpus(self.gpus, rasterizer)
         if launcher.is_rank():
-            launcher.join_started(asked)
+            launcher.join_started("--processes" if self.gpus is None else "--gpus", asked)
             return False
         if asked is None or asked == 1:
             return False

@@ -21,7 +21,6 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
-from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.stages.appearance import ViewAppearance
 from lapgs_plugin.stages.geometry import StageGeometry, depth_weight
@@ -31,13 +30,14 @@ from lapgs_plugin.stages.view_transforms import ViewTransforms
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
 from lapgs_plugin.training.dropout import thinned
 from lapgs_plugin.training.joint import JointFields
+from lapgs_plugin.training.launches import LaunchPlanner, PlannedLaunch
 from lapgs_plugin.training.losses import LossOf, ViewLosses
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses, at_pose
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.ranks.equality import require_equal_fields
 from lapgs_plugin.training.ranks.sums import StepSums
-from lapgs_plugin.training.schedule import PIXELS_OF_A_LAUNCH, StageSchedule
+from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.scoring import FieldScoring
 from lapgs_plugin.training.stage_start import joint_fields
 from lapgs_plugin.training.time_budget import StageBudget
@@ -49,20 +49,6 @@ LOSS_SMOOTHING = 0.95
 """Weight of earlier losses in the loss that is shown and logged: single views differ too much to show a trend."""
 LOSSES_READ_EVERY = 50
 """Losses that are read together on a GPU: each reading waits until the GPU has caught up with the processor."""
-
-
-@dataclass(frozen=True)
-class _Planned:
-    """Hold views that are rendered together, at the poses of their scene.
-
-    Attributes:
-        iterations: that train them, in order.
-        part: of the step, see `WholeSteps.own`.
-    """
-
-    iterations: Sequence[int]
-    views: Sequence[LevelView]
-    part: int
 
 
 @dataclass(frozen=True)
@@ -105,7 +91,6 @@ class StageRun:
         say: shows a line to the user.
         joint: the finished fields while they are trained jointly; None before.
         loss: smoothed loss, NaN before the first iteration and after a finished stage.
-        most_views: views in one launch that fit into the GPU's memory; None as long as all have.
         step_views: number of views of the last step.
         background: (3,) behind the base; residuals are rendered over zero.
 
@@ -127,12 +112,10 @@ class StageRun:
     budget: StageBudget | None = None
     joint: JointFields | None = None
     loss: float = math.nan
-    most_views: int | None = None
     step_views: int = 1
     _late_steps: int = 0  # whose losses are in `_unread`
     _unread: list[tuple[Tensor, int, int]] = field(default_factory=list)  # losses, their last iterations, how many
     _context: StageContext | None = None  # of the last rendered view; None without hooks of a user
-    _following: tuple[range, list[_Planned]] | None = None  # the next step, planned while this one was run
 
     def __post_init__(self) -> None:
         prepared, stage = self.prepared, self.stage
@@ -143,9 +126,14 @@ class StageRun:
         self._sums = StepSums(self._steps) if self._steps.shared else None
         for learned in filter(None, self.transforms.values()):
             learned.ranks = prepared.ranks
-        self._size_groups = prepared.size_groups(stage.level) if prepared.batches else {}
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
-        self._joint_from = settings.joint_from(replace(stage, iterations=self.schedule.iterations))
+        self._planner = LaunchPlanner(
+            views=self._views,
+            steps=self._steps,
+            schedule=self.schedule,
+            size_groups=prepared.size_groups(stage.level) if prepared.batches else None,
+            joint_from=settings.joint_from(replace(stage, iterations=self.schedule.iterations)),
+        )
         self._dropout = settings.dropout_for(len(self._views))
         # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
         self._inherits_moments = stage.signed and settings.inherit_mode == "full"
@@ -184,18 +172,22 @@ class StageRun:
         while self.counts.iteration < self.stage.iterations:
             self._profile()
             self.record.resume_clock()
-            iterations = self._next(self.counts.iteration)
+            iterations = self._planner.step_after(self.counts.iteration)
             self.step_views = len(iterations)
             self._step(iterations)
             self.record.pause_clock()
             self.counts.iteration += self.step_views
-            if self.budget is not None:
-                length = self.budget.length(self.counts.iteration)
-                self._last(self.prepared.ranks.from_leader(length))
+            self._fit_into_time()
             if self._late_steps >= LOSSES_READ_EVERY or self.counts.iteration == self.stage.iterations:
                 self.settle()
             after_iteration(self)
         self._profile()
+
+    def _fit_into_time(self) -> None:
+        """Let the stage have the iterations that the clock allows, as rank 0 decides after some steps for all ranks."""
+        ranks, ended = self.prepared.ranks, self.counts.iteration >= self.stage.iterations
+        if self.budget is not None and (ended or self._late_steps % ranks.steps_a_decision == 0):
+            self._last(ranks.from_leader(self.budget.length(self.counts.iteration)))
 
     def _last(self, iterations: int) -> None:
         """Let the stage have so many iterations."""
@@ -208,11 +200,10 @@ class StageRun:
         statistics = self.densifier.state
         self.densifier = self.prepared.density_control(self.stage, self.schedule)
         self.densifier.state = statistics
-        if self.joint is None:
-            self._joint_from = self._settings.joint_from(self.stage)
+        joint_from = self._settings.joint_from(self.stage) if self.joint is None else self._planner.joint_from
+        self._planner = replace(self._planner, schedule=self.schedule, joint_from=joint_from)
         for learned in filter(None, self.transforms.values()):
             learned.total = self.prepared.plan.iterations
-        self._following = None
 
     def _profile(self) -> None:
         """Start or end a profile if it is due, outside the timed region."""
@@ -259,10 +250,6 @@ class StageRun:
         self.joint = joint_fields(self.prepared, self.poses, states)
         self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
 
-    def _is_joint(self, iteration: int) -> bool:
-        """Return whether the finished fields are trained jointly in an iteration."""
-        return self._joint_from is not None and iteration >= self._joint_from
-
     @property
     def _models(self) -> list[TrainableField]:
         """The fields under training."""
@@ -295,48 +282,12 @@ class StageRun:
     @property
     def first_view(self) -> LevelView:
         """The view that the stage's first iteration renders."""
-        return at_pose(self._view(1), self.poses)
-
-    def _next(self, done: int) -> range:
-        """Return the iterations of the step after `done` ones."""
-        return range(done + 1, done + 1 + self.schedule.views_of_step(done))
-
-    def _launches(self, iterations: range) -> list[_Planned]:
-        """Group those iterations of a step that this rank trains into launches, see `_launches_of`."""
-        parts = enumerate(self._steps.parts(iterations))
-        return [launch for part, own in parts for launch in self._launches_of(part, own)]
-
-    def _launches_of(self, part: int, iterations: Sequence[int]) -> list[_Planned]:
-        """Group iterations into launches: views of similar sizes and one SH degree, no more than fit."""
-        views = [self._view(iteration) for iteration in iterations]
-        if not self.prepared.batches or len(iterations) == 1:
-            return [_Planned([iteration], [view], part) for iteration, view in zip(iterations, views, strict=True)]
-        alike: dict[tuple[bool, int, int], list[int]] = {}
-        for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
-            degree = self.schedule.active_sh_degree(iteration)
-            key = self._is_joint(iteration), self._size_groups[view.camera.size], degree
-            alike.setdefault(key, []).append(index)
-        launches = []
-        for group in alike.values():
-            width, height = largest_size([views[index].camera.size for index in group])
-            most = max(1, round(PIXELS_OF_A_LAUNCH / (width * height)))
-            count = math.ceil(len(group) / min(most, self.most_views or most))
-            size = math.ceil(len(group) / count)
-            for start in range(0, len(group), size):
-                chosen = group[start : start + size]
-                launches.append(_Planned([iterations[i] for i in chosen], [views[i] for i in chosen], part))
-        return launches
-
-    def _planned(self, iterations: range) -> list[_Planned]:
-        """Return the launches of a step, which the step before may have planned to prefetch the images."""
-        if self._following is None or self._following[0] != iterations:
-            self._following = iterations, self._launches(iterations)
-        return self._following[1]
+        return at_pose(self._planner.view(1), self.poses)
 
     def _step(self, iterations: range) -> None:
         """Render all views of a step, propagate their losses back, and step the optimizers once."""
         last = iterations[-1]
-        if self._sums is not None and self.joint is None and self._is_joint(last):
+        if self._sums is not None and self.joint is None and self._planner.is_joint(last):
             self.train_jointly(None)  # on all ranks at once, whichever of them has the first view
         launches = self._run_launches(iterations)
         self._breakdown.mark("backward")
@@ -366,7 +317,7 @@ class StageRun:
                     self.densifier.accumulate(launch.result, launch.camera)
             self._densify(context, last, launches[-1].result, launches[-1].camera)
         else:  # statistics of all views are there
-            self._densify(context, last, None, at_pose(self._view(last), self.poses).camera)
+            self._densify(context, last, None, at_pose(self._planner.view(last), self.poses).camera)
         self._breakdown.mark("other")
         if last % FINITE_CHECK_EVERY < len(iterations) or last == self.stage.iterations:
             self.require_finite(last)
@@ -387,9 +338,9 @@ class StageRun:
     def _run_launches(self, iterations: range) -> list[_Launch]:
         """Run all launches of a step. If the GPU's memory is too small, start the step again with smaller launches."""
         while True:
-            planned = self._planned(iterations)
+            planned = self._planner.launches(iterations)
             is_last = iterations[-1] == self.stage.iterations
-            following = [] if is_last else self._planned(self._next(iterations[-1]))[:1]
+            following = [] if is_last else self._planner.launches(self._planner.step_after(iterations[-1]))[:1]
             try:
                 thens = [*planned[1:], *following, None]
                 done = self._run_planned(planned, thens)
@@ -404,14 +355,13 @@ class StageRun:
                 return done
             # Outside of `except`, because the error keeps the tensors of the render alive.
             self._forget_gradients()
-            self.most_views = most // 2
-            self._following = None
+            self._planner.limit(most // 2)
             self.say(
                 f"level {self.stage.level}: no memory for {most} views at once; from here on {most // 2} are rendered "
                 "together, and steps take as many as before"
             )
 
-    def _run_planned(self, planned: Sequence[_Planned], thens: Sequence[_Planned | None]) -> list[_Launch]:
+    def _run_planned(self, planned: Sequence[PlannedLaunch], thens: Sequence[PlannedLaunch | None]) -> list[_Launch]:
         """Run launches; the images of the first of `thens` are prefetched in the first one, and so on."""
         done: list[_Launch] = []
         for part, launches in groupby(zip(planned, thens, strict=False), key=lambda pair: pair[0].part):
@@ -437,10 +387,10 @@ class StageRun:
         """Learned transforms of the training views, by their names in checkpoints."""
         return {"appearance": self.appearance, "poses": self.poses}
 
-    def _launch(self, planned: _Planned, then: _Planned | None) -> _Launch:
+    def _launch(self, planned: PlannedLaunch, then: PlannedLaunch | None) -> _Launch:
         """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""
         iterations, last = planned.iterations, planned.iterations[-1]
-        if self.joint is None and self._is_joint(last):
+        if self.joint is None and self._planner.is_joint(last):
             self.train_jointly(None)
         views = [at_pose(view, self.poses) for view in planned.views]
         names, cameras = [view.name for view in views], [view.camera for view in views]
@@ -511,17 +461,14 @@ class StageRun:
         image = self._rasterizer.render_image(gaussians, cameras[0], background=self.background, sh_degree=degree)
         return image, None
 
-    def _view(self, iteration: int) -> LevelView:
-        return self._views[self._steps.view(iteration)]
-
-    def _prefetch(self, planned: _Planned) -> None:
+    def _prefetch(self, planned: PlannedLaunch) -> None:
         """Copy the images of the next launch to the device while this one renders; files of those that follow, too."""
         names = [view.name for view in planned.views[:AHEAD]]
         if self._settings.images_on == "disk":
             after = max(planned.iterations) + 1
             later = range(after, min(after + AHEAD - len(names), self.stage.iterations + 1))
             own = sorted(iteration for part in self._steps.parts(later) for iteration in part)
-            names += [self._view(iteration).name for iteration in own]
+            names += [self._planner.view(iteration).name for iteration in own]
         self.images.photos.prefetch(*names)
         if self.images.predictions is not None:
             for name in names:
@@ -580,7 +527,7 @@ class StageRun:
             "level": self.stage.level,
             "counts": vars(self.counts),
             "loss": self.loss,
-            "most_views": self.most_views,
+            "most_views": self._planner.most_views,
             "breakdown": self._breakdown.seconds(),
             "budget": None if self.budget is None else self.budget.state(),
             "model": self.model.state(),
@@ -593,7 +540,7 @@ class StageRun:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a result of `state`; model and record must have been made from it already."""
-        self.loss, self.most_views = state["loss"], state["most_views"]
+        self.loss, self._planner.most_views = state["loss"], state["most_views"]
         self.densifier.state = {
             name: value.to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()

@@ -24,6 +24,7 @@ from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.training.preparation import TrainRequest, prepare
 from lapgs_plugin.training.ranks.group import ALONE
 from lapgs_plugin.training.ranks.shards import epoch_order, tree_sum
+from lapgs_plugin.training.ranks.steps import SharedSteps
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
 from lapgs_plugin.training.trainer import Trainer
@@ -42,6 +43,7 @@ OPTIONS: Sequence[object] = (
     *("--iterations", 400, "--levels", 2, "--strategy", "3dgs", "--densify-every", 20, "--sh-degree", 1, "--eval"),
     *("--views-per-step", 4, "--checkpoint-every", 40),
 )
+Pair = tuple[Path, list["subprocess.Popen[str]"], list[str]]
 SETTINGS = TrainSettings(
     iterations=400,
     levels=2,
@@ -98,26 +100,46 @@ def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     return plys(RunArchive.open(out))
 
 
-def test_two_ranks_train_to_the_bits_of_one_process(tmp_path: Path) -> None:
-    pair = ranks.start("tests.ranks", [[tmp_path / "two", *ranks.CASES]] * 2)
+@pytest.fixture(scope="module")
+def pair(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pair:
+    """Two ranks of `tests.ranks`, at last of different runs: their folder, processes and outputs."""
+    folder = tmp_path_factory.mktemp("two")
+    words = [folder, "train", scene, "-o", folder / "run", *OPTIONS]
+    started = ranks.start("tests.ranks", [words, [*words, "--seed", 7]])
+    return folder, started, [process.communicate(timeout=TIMEOUT)[0] for process in started]
+
+
+def test_two_ranks_train_to_the_bits_of_one_process(pair: Pair, tmp_path: Path) -> None:
+    folder, _, outputs = pair
     for name in ranks.CASES:
-        (tmp_path / "one").mkdir(exist_ok=True)
-        ranks.train(tmp_path / "one" / name, name, ALONE)
-    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in pair]
-    assert [process.returncode for process in pair] == [0, 0], outputs
-    for name in ranks.CASES:
-        one, two = (RunArchive.open(tmp_path / kind / name) for kind in ("one", "two"))
+        ranks.train(tmp_path / name, name, ALONE)
+        assert (folder / name).is_dir(), outputs
+        one, two = RunArchive.open(tmp_path / name), RunArchive.open(folder / name)
         assert plys(one) == plys(two), name
         assert figures(one) == figures(two), name
 
 
-def test_a_run_that_is_stopped_and_killed_ends_with_the_bits_of_one_that_is_not(
-    scene: Path, whole: list[bytes], tmp_path: Path
-) -> None:
-    out = tmp_path / "run"
-    words = ["train", scene, "-o", out, *OPTIONS]
+def test_ranks_whose_fields_differ_do_not_go_on(pair: Pair) -> None:
+    folder, _, outputs = pair
+    for output in outputs:
+        assert "level 0, iteration 0: the field of rank 1 is not that of rank 0" in output
+    assert RunArchive.open(folder / ranks.DIFFERENT).available_levels == ()
 
-    on_two = command(*words, "--processes", 2)
+
+def test_ranks_of_different_runs_are_refused_by_rank_0_alone(
+    pair: Pair,
+) -> None:
+    folder, started, (first, second) = pair
+    assert [process.returncode for process in started] == [2, 2]
+    (line,) = errors(first)
+    assert "rank 1 has other settings than rank 0 (seed: 7 and 0)" in line
+    assert errors(second) == []
+    assert not (folder / "run").exists()
+
+
+def stopped_on_two(scene: Path, out: Path) -> None:
+    """Start a run on two ranks, and stop it by SIGTERM; checks its line."""
+    on_two = command("train", scene, "-o", out, *OPTIONS, "--processes", 2)
     wait_for(lambda: on_two.poll() is not None or (out / HISTORY).exists(), TIMEOUT)
     on_two.send_signal(signal.SIGTERM)
     output, _ = on_two.communicate(timeout=TIMEOUT)
@@ -125,8 +147,27 @@ def test_a_run_that_is_stopped_and_killed_ends_with_the_bits_of_one_that_is_not(
     (line,) = errors(output)
     assert "a checkpoint is in" in line
 
+
+def test_a_run_that_is_stopped_continues_in_one_process_to_the_same_bits(
+    scene: Path, whole: list[bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    stopped_on_two(scene, out)
+    with prepare(TrainRequest(scene, out, SETTINGS, SceneOptions(eval=True), resume=True)) as run:
+        Trainer(run).run()
+    assert plys(RunArchive.open(out)) == whole
+
+
+@pytest.mark.slow
+def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
+    scene: Path, whole: list[bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    stopped_on_two(scene, out)
+    words = ["train", scene, "-o", out, *OPTIONS, "--resume"]
+
     written = (out / CHECKPOINT).stat().st_mtime_ns
-    on_four = command(*words, "--resume", "--processes", 4)
+    on_four = command(*words, "--processes", 4)
     wait_for(lambda: on_four.poll() is not None or (out / CHECKPOINT).stat().st_mtime_ns > written, TIMEOUT)
     os.kill(children(on_four)[-1], signal.SIGKILL)
     began = time.monotonic()
@@ -138,31 +179,13 @@ def test_a_run_that_is_stopped_and_killed_ends_with_the_bits_of_one_that_is_not(
     assert "SIGKILL" in line
     assert "--resume" in line
 
-    on_one = command(*words, "--resume")
+    on_one = command(*words)
     output, _ = on_one.communicate(timeout=TIMEOUT)
     assert on_one.returncode == 0, output
     assert plys(RunArchive.open(out)) == whole
 
 
-def test_ranks_of_different_runs_are_refused_by_rank_0_alone(scene: Path, tmp_path: Path) -> None:
-    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
-    pair = ranks.start("lapgs_plugin", [words, [*words, "--seed", 7]])
-    first, second = (process.communicate(timeout=TIMEOUT)[0] for process in pair)
-    assert [process.returncode for process in pair] == [2, 2]
-    (line,) = errors(first)
-    assert "rank 1 has other settings than rank 0 (seed: 7 and 0)" in line
-    assert errors(second) == []
-    assert not (tmp_path / "run").exists()
-
-
-def test_ranks_whose_fields_differ_do_not_go_on(tmp_path: Path) -> None:
-    pair = ranks.start("tests.ranks", [[tmp_path, ranks.DIFFERENT]] * 2)
-    outputs = [process.communicate(timeout=TIMEOUT)[0] for process in pair]
-    for process, output in zip(pair, outputs, strict=True):
-        assert process.returncode != 0
-        assert "level 0, iteration 0: the field of rank 1 is not that of rank 0" in output
-
-
+@pytest.mark.slow
 def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [f"{number}.png" for number in range(2)])
     three = ranks.start("lapgs_plugin", [["train", scene, "-o", tmp_path / "run", "--iterations", 20]] * 3)
@@ -193,6 +216,17 @@ def test_an_epoch_has_every_view_once_and_shards_in_turn(count: int, shards: int
     order = epoch_order(count, 0, 0, epoch, shards)
     assert sorted(order) == list(range(count))
     assert [view % shards for view in order] == [position % shards for position in range(count)]
+
+
+@given(st.integers(1, 40), st.integers(0, 20))
+def test_what_is_due_every_second_time_is_due_for_all_views_and_for_all_ranks_alike(count: int, start: int) -> None:
+    steps = SharedSteps(count, 0, 0, 8, ALONE, exact=True)
+    due = [i for i in range(start * count + 1, (start + 40) * count + 1) if steps.turn(i) % 2 == 0]
+    assert {steps.view(iteration) for iteration in due} == set(range(count))
+    for ranks_now in (2, 4):
+        for first in range(1, count - 6, 8):
+            numbers = [steps.view(i) % 8 % ranks_now for i in range(first, first + 8) if steps.turn(i) % 2 == 0]
+            assert sorted(numbers) == sorted([*range(ranks_now)] * (4 // ranks_now))
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 8])

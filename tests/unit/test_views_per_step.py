@@ -473,7 +473,7 @@ def test_views_of_several_sizes_are_rendered_by_size(tmp_path: Path) -> None:
 def test_launches_stay_small_where_images_are_large(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lapgs_plugin.training.stage.PIXELS_OF_A_LAUNCH", 3 * 56 * 40)
+    monkeypatch.setattr("lapgs_plugin.training.launches.PIXELS_OF_A_LAUNCH", 3 * 56 * 40)
     settings = replace(
         SETTINGS, levels=1, views_per_step="4", iterations=8, accumulate_views=1, densification=Densification(until=0)
     )

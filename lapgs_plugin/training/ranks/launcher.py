@@ -51,11 +51,12 @@ def is_rank() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ and os.environ.get("WORLD_SIZE", "1") != "1"
 
 
-def join_started(asked: int | None) -> None:
+def join_started(option: str, asked: int | None) -> None:
     """Get ready to be one of the ranks that torchrun's agent started.
 
     Args:
-        asked: number of ranks that the command line asks for; None leaves it to torchrun.
+        option: that asks for a number of ranks.
+        asked: this number; None leaves it to torchrun.
 
     Raises:
         UserInputError: that is another number.
@@ -63,7 +64,7 @@ def join_started(asked: int | None) -> None:
     started = int(os.environ["WORLD_SIZE"])
     if asked not in (None, started):
         raise UserInputError(
-            f"--gpus {asked}: torchrun started {started} ranks; leave the option out, or give {started}"
+            f"{option} {asked}: torchrun started {started} ranks; leave the option out, or give {started}"
         )
     _end_when_stuck()
 
