@@ -68,7 +68,10 @@ def settings(strategy: Any, name: str, **values: Any) -> TrainSettings:
 CASES: dict[str, tuple[Callable[[], Scene], TrainSettings]] = {
     "laplacian": (plain_scene, settings(Gradients(), "3dgs", hierarchy="laplacian", joint=0.5)),
     "nested": (plain_scene, settings(Mcmc(cap_max=150), "mcmc", hierarchy="nested", appearance="affine", dropout=0.3)),
-    "masks": (masked_scene, settings(Mcmc(cap_max=150), "mcmc", hierarchy="laplacian", joint=0.5)),
+    "masks": (
+        masked_scene,
+        settings(Mcmc(cap_max=150), "mcmc", hierarchy="laplacian", joint=0.5, appearance="bilateral", keep="best"),
+    ),
     "mixed sizes": (mixed_scene, settings(Multiview(), "multiview", levels=1, prune=0.02)),
     "poses": (plain_scene, settings(Gradients(), "3dgs", levels=1, refine_poses=True, keep="best")),
 }

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_plugin.errors import SceneError, UserInputError, counted, first_line, printable
+from lapgs_plugin.errors import SceneError, counted, first_line, printable
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_folder
 from lapgs_plugin.scenes.blender import depth_files, has_transforms
@@ -24,7 +24,7 @@ from lapgs_plugin.scenes.exports.points import MILLIMETRES
 from lapgs_plugin.scenes.exports.registry import find_export
 from lapgs_plugin.scenes.image_files import check_size
 from lapgs_plugin.scenes.images import read_depth, same_shape
-from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, stem_of
+from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_folder, stem_of
 from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.untrusted import require_regular
@@ -147,11 +147,9 @@ def resolve_depth(scene: Path, setting: str) -> str:
     """
     if setting == AUTO:
         return _own_depth(scene)
-    if setting in (NONE, POINTS, TRANSFORMS) or is_folder(scene / setting):
+    if setting in (NONE, POINTS, TRANSFORMS):
         return setting
-    if not is_folder(Path(setting)):
-        raise UserInputError(f"--depth {setting}: no such folder; expected a folder of depth maps, points or none")
-    return str(Path(setting).absolute())
+    return resolve_folder(scene, setting, "--depth", "a folder of depth maps, points or none")
 
 
 def _own_depth(scene: Path) -> str:
@@ -253,22 +251,7 @@ def _preference(file: Path) -> int:
 
 def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str, say: Say) -> DepthMaps:
     """Read maps; the scene's points say whether they hold depths or inverse depths, and their scales and shifts."""
-    views = [view for view in scene.train if view.name in files]
-
-    def load(view: View) -> Tensor | SceneError:
-        try:
-            return _read_map(files[view.name], view)
-        except SceneError as error:
-            return error
-
-    results = in_threads("Reading depth maps", "maps", load, views, most=MAP_THREADS, progress=False)
-    values = {view.name: result for view, result in zip(views, results, strict=True) if isinstance(result, Tensor)}
-    problems = [result for result in results if isinstance(result, SceneError)]
-    if not values:
-        raise SceneError(f"{where}: no depth map can be used, of {len(files)}; the first: {problems[0]}; {MAPS_ADVICE}")
-    if problems:
-        others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        say(f"depth: {counted(len(problems), 'map')} not used, the first: {problems[0]}{others}")
+    values = read_maps(scene.train, files, _read_map, "depth", say)
     seen = _seen_points(scene, images)
     is_inverse = _holds_inverse_depth(values, seen)
     maps = {name: value if is_inverse else 1.0 / value for name, value in values.items()}
@@ -288,6 +271,43 @@ def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str,
     if few := len(maps) - len(fits):
         say(f"depth: {counted(few, 'map')} not used, because no more than a few points tell their scale")
     return DepthMaps({name: (scale * maps[name] + shift).clamp_min(0.0) for name, (scale, shift) in fits.items()})
+
+
+def read_maps(
+    views: Sequence[View], files: Mapping[str, Path], read: Callable[[Path, View], Tensor], kind: str, say: Say
+) -> dict[str, Tensor]:
+    """Return the maps of those views that have one that can be used, by view.
+
+    Args:
+        views: of the scene.
+        files: result of `find_maps`, of one of the views at least.
+        read: reads a file for its view, or raises a SceneError.
+        kind: of the maps, "depth" or "normals".
+        say: receives a line if some cannot be used.
+
+    Raises:
+        SceneError: none can be used.
+    """
+    mapped = [view for view in views if view.name in files]
+
+    def load(view: View) -> Tensor | SceneError:
+        try:
+            return read(files[view.name], view)
+        except SceneError as error:
+            return error
+
+    results = in_threads(f"Reading maps of {kind}", "maps", load, mapped, most=MAP_THREADS, progress=False)
+    maps = {view.name: result for view, result in zip(mapped, results, strict=True) if isinstance(result, Tensor)}
+    problems = [result for result in results if isinstance(result, SceneError)]
+    if not maps:
+        advice = f"correct them, or train without (--{kind} none)"
+        raise SceneError(
+            f"none of {counted(len(files), 'map')} of {kind} can be used; the first: {problems[0]}; {advice}"
+        )
+    if problems:
+        others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        say(f"{kind}: {counted(len(problems), 'map')} not used, the first: {problems[0]}{others}")
+    return maps
 
 
 def _unit_factor(file: Path) -> float:

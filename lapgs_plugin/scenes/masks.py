@@ -40,11 +40,9 @@ def resolve_masks(scene: Path, setting: str) -> str:
         if (scene / MASKS).is_symlink() and not is_folder(scene / MASKS):
             raise UserInputError(f"{scene / MASKS} is a link to no folder; put the masks there, or remove it")
         return MASKS if is_folder(scene / MASKS) else mask_folder(scene) or NONE
-    if setting in (NONE, ALPHA) or is_folder(scene / setting):
+    if setting in (NONE, ALPHA):
         return setting
-    if not is_folder(Path(setting)):
-        raise UserInputError(f"--masks {setting}: no such folder; expected a folder of masks, alpha or none")
-    return str(Path(setting).absolute())
+    return resolve_folder(scene, setting, "--masks", "a folder of masks, alpha or none")
 
 
 def resolve_sky(scene: Path, setting: str) -> str:
@@ -53,12 +51,26 @@ def resolve_sky(scene: Path, setting: str) -> str:
     Raises:
         UserInputError: there is no such folder.
     """
-    if setting == NONE or is_folder(scene / setting):
+    if setting == NONE:
+        return setting
+    return resolve_folder(scene, setting, "--sky", "a folder of masks, white where sky is, or none")
+
+
+def resolve_folder(scene: Path, setting: str, option: str, expected: str) -> str:
+    """Resolve a folder beside the photos, relative to the scene or absolute.
+
+    Args:
+        scene: its folder.
+        setting: value of an option.
+        option, expected: its name and what it may be, for the message.
+
+    Raises:
+        UserInputError: there is no such folder.
+    """
+    if is_folder(scene / setting):
         return setting
     if not is_folder(Path(setting)):
-        raise UserInputError(
-            f"--sky {setting}: no such folder; expected a folder of masks, white where sky is, or none"
-        )
+        raise UserInputError(f"{option} {setting}: no such folder; expected {expected}")
     return str(Path(setting).absolute())
 
 

@@ -10,13 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lapgs_plugin.errors import SceneError, UserInputError, counted, first_line, printable
-from lapgs_plugin.files import is_folder
-from lapgs_plugin.scenes.depth import INSIDE_SHARE, MAP_THREADS, depth_size, find_maps
+from lapgs_plugin.errors import SceneError, first_line, printable
+from lapgs_plugin.scenes.depth import INSIDE_SHARE, depth_size, find_maps, read_maps
 from lapgs_plugin.scenes.image_files import check_size
 from lapgs_plugin.scenes.images import read_image, same_shape
-from lapgs_plugin.scenes.masks import NONE, stem_of
-from lapgs_plugin.scenes.parallel import in_threads
+from lapgs_plugin.scenes.masks import NONE, resolve_folder, stem_of
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.untrusted import require_regular
 
@@ -37,11 +35,7 @@ def resolve_normals(scene: Path, setting: str) -> str:
     Raises:
         UserInputError: there is no such folder.
     """
-    if setting == NONE or is_folder(scene / setting):
-        return setting
-    if not is_folder(Path(setting)):
-        raise UserInputError(f"--normals {setting}: no such folder; expected a folder of normal maps, or none")
-    return str(Path(setting).absolute())
+    return NONE if setting == NONE else resolve_folder(scene, setting, "--normals", "a folder of normal maps, or none")
 
 
 def load_normals(scene: Scene, setting: str, say: Say) -> dict[str, Tensor]:
@@ -66,22 +60,7 @@ def load_normals(scene: Scene, setting: str, say: Say) -> dict[str, Tensor]:
             f"{folder}: no normal map of any of the {len(names)} training photos, expected the names of photos with "
             f"or without _normal, such as {printable(stem_of(names[0]))}.png; {ADVICE}"
         )
-    views = [view for view in scene.train if view.name in files]
-
-    def load(view: View) -> Tensor | SceneError:
-        try:
-            return _read_normals(files[view.name], view)
-        except SceneError as error:
-            return error
-
-    results = in_threads("Reading normal maps", "maps", load, views, most=MAP_THREADS, progress=False)
-    maps = {view.name: result for view, result in zip(views, results, strict=True) if isinstance(result, Tensor)}
-    problems = [result for result in results if isinstance(result, SceneError)]
-    if not maps:
-        raise SceneError(f"{folder}: no normal map can be used, of {len(files)}; the first: {problems[0]}; {ADVICE}")
-    if problems:
-        others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        say(f"normals: {counted(len(problems), 'map')} not used, the first: {problems[0]}{others}")
+    maps = read_maps(scene.train, files, _read_normals, "normals", say)
     backward = _are_backward(maps, str(folder))
     axes = "y up, z backward (OpenGL)" if backward else "y down, z forward (OpenCV)"
     say(f"normals ({folder}): {len(maps)} of {len(names)} training photos have a map, read as x right, {axes}")

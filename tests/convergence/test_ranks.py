@@ -40,15 +40,17 @@ pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reaso
 TIMEOUT = 600.0
 """Seconds until a command counts as stuck; a busy machine takes a hundred times as long as an idle one."""
 OPTIONS: Sequence[object] = (
-    *("--iterations", 400, "--levels", 2, "--strategy", "3dgs", "--densify-every", 20, "--sh-degree", 1, "--eval"),
-    *("--views-per-step", 4, "--checkpoint-every", 40),
+    *("--iterations", 320, "--levels", 2, "--strategy", "3dgs", "--densify-every", 20, "--sh-degree", 1, "--eval"),
+    *("--views-per-step", 4, "--checkpoint-every", 40, "--appearance", "bilateral", "--keep", "best"),
 )
 Pair = tuple[Path, list["subprocess.Popen[str]"], list[str]]
 SETTINGS = TrainSettings(
-    iterations=400,
+    iterations=320,
     levels=2,
     sh_degree=1,
     views_per_step="4",
+    appearance="bilateral",
+    keep="best",
     densification=Densification(strategy="3dgs", options=Gradients(), every=20),
     ranks=2,
 )
@@ -87,7 +89,7 @@ def children(process: subprocess.Popen[str]) -> list[int]:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene"))
+    return write_scene(tmp_path_factory.mktemp("scene"), [f"{number:02d}.png" for number in range(16)])
 
 
 @pytest.fixture(scope="module")

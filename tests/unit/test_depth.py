@@ -140,7 +140,7 @@ def test_maps_that_cannot_be_used_are_named_and_the_others_are(scene: Path) -> N
 @pytest.mark.parametrize(
     ("write", "facts"),
     [
-        (lambda file: file.write_bytes(b"no image"), "no depth map can be used, of 1"),
+        (lambda file: file.write_bytes(b"no image"), "none of 1 map of depth can be used"),
         (lambda file: cv2.imwrite(str(file), np.full((64, 64), 3000, np.uint16)), "64x64 pixels, its photo 96x64"),
         (lambda file: cv2.imwrite(str(file), np.zeros(SIZE[::-1], np.uint16)), "fewer than 32 of its pixels are valid"),
         (lambda file: cv2.imwrite(str(file), np.zeros((*SIZE[::-1], 3), np.uint8)), "a picture in colours"),
