@@ -46,13 +46,13 @@ class StartOptions:
     overwrite: bool = option(False, "Replace the run in --out.")
     gpus: int | None = option(
         None,
-        "Share the views of each step out over so many GPUs of this machine; see `lapgs help scale`. torchrun -m "
-        "lapgs_plugin train does the same, also on several machines.",
+        "Train on this many GPUs of the machine, which share the views of each step; see `lapgs help scale`. torchrun "
+        "-m lapgs_plugin train does the same, also on several machines.",
         least=1,
         most=1024,
     )
     processes: int | None = option(
-        None, "The same over so many processes on its processors, to try --gpus without GPUs.", least=1, most=1024
+        None, "Train on this many processes on CPUs instead, to try --gpus without GPUs.", least=1, most=1024
     )
     viewing: ViewOptions = field(default_factory=ViewOptions)
 

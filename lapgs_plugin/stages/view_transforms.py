@@ -14,8 +14,8 @@ BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
 
 
-class OneProcess:
-    """Sum gradients over the processes that train the views: this one alone."""
+class Processes:
+    """Sum gradients over the processes that train the views: this one alone, unless a subclass has others."""
 
     @property
     def leads(self) -> bool:
@@ -54,7 +54,7 @@ class ViewTransforms(ABC):
     transforms: torch.nn.Parameter  # (v, ...)
     done: int
     total: int
-    ranks: OneProcess = field(init=False, repr=False, default=OneProcess())  # holds nothing
+    ranks: Processes = field(init=False, repr=False, default=Processes())  # holds nothing
     _index: dict[str, int] = field(init=False, repr=False)
     _adam: torch.optim.Adam = field(init=False, repr=False)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 from pathlib import Path
 
@@ -97,7 +98,9 @@ def test_cameras_that_are_not_fixed_to_each_other_keep_their_poses(
     result = run(tmp_path / "in", tmp_path / "out")
     assert len(result.registered) == 10
     assert result.reprojection_error < 1.0
-    assert any("the cameras do not fit a rig (26% of the features" in message for message in caplog.messages)
+    assert any(
+        re.search(r"the cameras do not fit a rig \(\d+% of the features", message) for message in caplog.messages
+    )
 
 
 @pytest.mark.parametrize(
@@ -106,6 +109,7 @@ def test_cameras_that_are_not_fixed_to_each_other_keep_their_poses(
         (("a.png", "b.png"), {}, SceneError, "has photos without subfolders, expected a subfolder for each"),
         (("l/a.png", "l/b.png"), {}, SceneError, "has only l, expected a subfolder for each"),
         (("l/a.png", "r/a.png", "b.png"), {}, SceneError, r"has photos beside them \(b.png\)"),
+        (("l/a.png", "l/r/a.png"), {}, SceneError, "has photos in l and in l/r, expected folders of cameras beside"),
         (("l/a.png", "r/b.png"), {}, SceneError, "no photo of l and r has the same name, such as l/a.png"),
         (("l/a.png", "r/a.png"), {"matcher": "sequential"}, UserInputError, "--matcher sequential with"),
     ],

@@ -43,11 +43,18 @@ def check_rig(job: Job) -> None:
     moments = _moments(job.names)
     sensors = sorted({sensor for names in moments.values() for sensor in names})
     if "" in sensors or len(sensors) < 2:
-        found = f"photos beside them ({listed([names[''] for names in moments.values() if '' in names])})"
+        present = f"photos beside them ({listed([names[''] for names in moments.values() if '' in names])})"
         if len(sensors) == 1:
-            found = f"only {sensors[0]}" if sensors[0] else "photos without subfolders"
+            present = f"only {sensors[0]}" if sensors[0] else "photos without subfolders"
         raise SceneError(
-            f"--camera-per {RIG}: {folder} has {found}, expected a subfolder for each of two or more cameras"
+            f"--camera-per {RIG}: {folder} has {present}, expected a subfolder for each of two or more cameras"
+        )
+    # COLMAP tells cameras apart by how names begin.
+    if nested := [(one, other) for one in sensors for other in sensors if other.startswith(f"{one}/")]:
+        outer, inner = nested[0]
+        raise SceneError(
+            f"--camera-per {RIG}: {folder} has photos in {outer} and in {inner}, expected folders of cameras beside "
+            "each other; move one of them"
         )
     if chosen_matcher(job) == SEQUENTIAL:
         raise UserInputError(

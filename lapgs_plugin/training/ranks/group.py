@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, first_line
-from lapgs_plugin.stages.view_transforms import OneProcess
+from lapgs_plugin.stages.view_transforms import Processes
 from lapgs_plugin.training.ranks.shards import tree_sum
 
 PATIENCE = timedelta(days=1)
@@ -32,7 +32,7 @@ class RankLostError(LapgsError):
     """Another rank has ended, so that this one cannot go on."""
 
 
-class Ranks(OneProcess):
+class Ranks(Processes):
     """Train in this process alone; `JoinedRanks` has several.
 
     Attributes:
