@@ -220,24 +220,10 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
         raise RunFolderError(f"{out} is not a run, so there is nothing to continue; leave --resume out to start one")
     ranks = request.ranks
     with open_for(ranks, out, lambda kind: kind.open(out, resume=True)) as archive:
-        manifest, chosen = archive.manifest, request.chosen
-        file = archive.path(MANIFEST)
+        manifest, file = archive.manifest, archive.path(MANIFEST)
         _require_same_folder(out, Path(manifest.scene.path), scene_folder)
-        settings = settings_from_manifest(manifest, str(file))
-        if manifest.complete:
-            asked = request.settings.iterations if "iterations" in chosen else None
-            _require_untimed(out, settings, request.settings, asked)
-            if settings.time is None:
-                settings = extended_settings(archive, settings, asked, say)
-            else:
-                say(f"{out} is finished: its --time {settings.time} is over")
-            chosen -= {"iterations"}
-        wanted = _options(reference, request.settings, request.control.rasterizer)
-        _require_same(out, chosen, wanted, _options(manifest.scene, settings, manifest.rasterizer))
-        changed = {name: wanted[name] for name in MAY_CHANGE if name in chosen}
+        settings, changed = _continued_settings(request, reference, archive, say)
         began = request.began if changed.get("time") != settings.time and "time" in changed else None
-        if settings.ranks == 1 < ranks.size:  # from here on its sums are those of ranks
-            changed["ranks"] = ranks.size
         settings = replace(settings, **changed)
         with nullcontext() if changed else errors_about(file):
             placed = training_rasterizer(manifest.rasterizer, settings)
@@ -268,6 +254,32 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
             archive.change_settings({"ranks": settings.ranks})
         _say_about_photos(run, say)
         yield run
+
+
+def _continued_settings(
+    request: TrainRequest, reference: SceneReference, archive: RunArchive, say: Say
+) -> tuple[TrainSettings, dict[str, Any]]:
+    """Return the settings with which a run continues, and those that change then.
+
+    Raises:
+        RunFolderError, UserInputError: the manifest is damaged, or the run was started with other options.
+    """
+    out, manifest, chosen = Path(request.out), archive.manifest, request.chosen
+    settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
+    if manifest.complete:
+        asked = request.settings.iterations if "iterations" in chosen else None
+        _require_untimed(out, settings, request.settings, asked)
+        if settings.time is None:
+            settings = extended_settings(archive, settings, asked, say)
+        else:
+            say(f"{out} is finished: its --time {settings.time} is over")
+        chosen -= {"iterations"}
+    wanted = _options(reference, request.settings, request.control.rasterizer)
+    _require_same(out, chosen, wanted, _options(manifest.scene, settings, manifest.rasterizer))
+    changed = {name: wanted[name] for name in MAY_CHANGE if name in chosen}
+    if settings.ranks == 1 < request.ranks.size:  # from here on its sums are those of ranks
+        changed["ranks"] = request.ranks.size
+    return settings, changed
 
 
 def _silent(_: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -139,11 +139,16 @@ class PreparedRun(StagedRun):
     @contextmanager
     def image_cache(self) -> Iterator[None]:
         """See `StagedRun`; rank 0 removes the images of all ranks of a killed run, which may have had more."""
+        folder = self.archive.path(CACHE)
         if self.ranks.leads:
-            shutil.rmtree(self.archive.path(CACHE), ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
         self.ranks.wait()
-        with super().image_cache():
-            yield
+        try:
+            with super().image_cache():
+                yield
+        finally:
+            with suppress(OSError):  # other ranks may have images there
+                folder.rmdir()
 
     def steps_of(self, stage: Stage) -> WholeSteps:
         """Return which views the steps of a stage have, and which of them this process renders."""

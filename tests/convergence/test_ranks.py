@@ -19,9 +19,11 @@ from hypothesis import strategies as st
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import CHECKPOINT, HISTORY
+from lapgs_plugin.runs.layout import CACHE, CHECKPOINT, HISTORY
 from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.preparation import TrainRequest, prepare
+from lapgs_plugin.training.ranks.equality import digest
 from lapgs_plugin.training.ranks.group import ALONE
 from lapgs_plugin.training.ranks.shards import epoch_order, tree_sum
 from lapgs_plugin.training.ranks.steps import SharedSteps
@@ -33,6 +35,7 @@ from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_scene
 from tests.refusals import refuses
 from tests.training_runs import plys
+from tests.training_scene import blob_field
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="needs PyTorch with gloo")
@@ -167,10 +170,12 @@ def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
     out = tmp_path / "run"
     stopped_on_two(scene, out)
     words = ["train", scene, "-o", out, *OPTIONS, "--resume"]
+    (out / CACHE / "rank_5").mkdir(parents=True)  # as of a run on more ranks that was killed
 
     written = (out / CHECKPOINT).stat().st_mtime_ns
     on_four = command(*words, "--processes", 4)
     wait_for(lambda: on_four.poll() is not None or (out / CHECKPOINT).stat().st_mtime_ns > written, TIMEOUT)
+    assert not (out / CACHE).exists()
     os.kill(children(on_four)[-1], signal.SIGKILL)
     began = time.monotonic()
     output, _ = on_four.communicate(timeout=TIMEOUT)
@@ -229,6 +234,20 @@ def test_what_is_due_every_second_time_is_due_for_all_views_and_for_all_ranks_al
         for first in range(1, count - 6, 8):
             numbers = [steps.view(i) % 8 % ranks_now for i in range(first, first + 8) if steps.turn(i) % 2 == 0]
             assert sorted(numbers) == sorted([*range(ranks_now)] * (4 // ranks_now))
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_fields_have_equal_digests_if_all_their_bits_are_equal(count: int) -> None:
+    fields = [TrainableField.create(blob_field(count), SETTINGS.rates, 1.0) for _ in range(2)]
+    one, other = (digest([field]) for field in fields)
+    assert one == other
+    for param in fields[1].params.values() if count else ():
+        with torch.no_grad():
+            last = param.view(-1)[-1:]
+            before = last.clone()
+            last.copy_(torch.nextafter(before, before + 1))
+            assert digest([fields[1]]) != one
+            last.copy_(before)
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 8])
