@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -358,14 +359,19 @@ def _check_busy(control: TrainingControl, placed: PlacedRasterizer, settings: Tr
 def _say_about_photos(run: PreparedRun, say: Say) -> None:
     """Say the share of their pixels inside masks and in the sky, and whether a CPU takes hours for so many."""
     views, scene = (*run.scene.train, *run.aside, *run.scene.test), run.archive.manifest.scene
-    if run.ranks.leads and scene.sky != NONE:
-        shares = [share_inside([sky]) for view in views if (sky := view.sky) is not None]
-        say(
-            f"sky ({scene.sky}): {len(shares)} of {len(views)} photos have a mask, {fmean(shares):.0%} of their pixels "
-            "are sky"
-        )
-    if run.ranks.leads and any(view.masked for view in views):
-        share, masks = share_inside(view.mask for view in views), scene.masks if scene.sky == NONE else "and sky"
+
+    def mean(shares: Iterable[float]) -> tuple[float, int]:
+        """Return the mean and the number of some shares of the views of all ranks."""
+        known = list(chain.from_iterable(run.ranks.gathered([*shares])))
+        return fmean(known), len(known)
+
+    own = run.owned(views)  # masks of others would be read once more
+    if scene.sky != NONE:
+        share, count = mean(share_inside([sky]) for view in own if (sky := view.sky) is not None)
+        say(f"sky ({scene.sky}): {count} of {len(views)} photos have a mask, {share:.0%} of their pixels are sky")
+    if any(view.masked for view in views):
+        share, _ = mean(share_inside([view.mask]) for view in own)
+        masks = scene.masks if scene.sky == NONE else "and sky"
         say(f"masks ({masks}): {share:.0%} of the pixels are trained on and measured")
     size = run.plan[0].image_size
     if run.device.type == "cpu" and (hint := long_on_a_cpu(size, run.settings.iterations)):
