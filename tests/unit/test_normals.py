@@ -194,7 +194,10 @@ def _each(folder: Path, write: Callable[[Path], object]) -> None:
     ("change", "facts"),
     [
         (lambda folder: [file.unlink() for file in folder.iterdir()], "no normal map of any of the 4 training photos"),
-        (lambda folder: _each(folder, lambda file: file.write_bytes(b"no image")), "none of 4 maps of normals can be used"),
+        (
+            lambda folder: _each(folder, lambda file: file.write_bytes(b"no image")),
+            "none of 4 maps of normals can be used",
+        ),
         (
             lambda folder: _each(folder, lambda file: cv2.imwrite(str(file), np.full((64, 64, 3), 90, np.uint8))),
             "64x64",
