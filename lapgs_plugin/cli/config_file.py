@@ -23,7 +23,9 @@ from lapgs_plugin.untrusted import read_text, read_toml
 if TYPE_CHECKING:
     from lapgs_plugin.training.settings import TrainSettings
 
-OF_ONE_CALL = frozenset({"config", "out", "resume", "overwrite", "view", "view_port", "gpus", "processes"})
+OF_ONE_CALL = frozenset(
+    {"config", "out", "resume", "overwrite", "view", "view_port", "gpus", "processes", "tile", "base", "only_base"}
+)
 """Parameters of a call that do not change the trained run."""
 
 META_KEY = "lapgs_plugin.config"

@@ -22,13 +22,15 @@ from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option
 from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
+from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.options import SceneOptions
+from lapgs_plugin.tiles.options import TileOptions, require_options_of_base
 from lapgs_plugin.training.ranks import launcher
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 
 if TYPE_CHECKING:
-    from lapgs_plugin.runs.watcher import Watcher
     from lapgs_plugin.training.monitor import Monitor
+    from lapgs_plugin.training.preparation import TrainRequest
     from lapgs_plugin.training.prepared_run import PreparedRun
 
 CHOSEN_ONCE = ("rasterizer", "strategy")
@@ -54,11 +56,16 @@ class StartOptions:
     processes: int | None = option(
         None, "Train on this many processes on CPUs instead, to try --gpus without GPUs.", least=1, most=1024
     )
+    tiling: TileOptions = field(default_factory=TileOptions)
     viewing: ViewOptions = field(default_factory=ViewOptions)
 
     def __post_init__(self) -> None:
         if self.gpus is not None and self.processes is not None:
             raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
+        if self.tiling.asked is not None:
+            for name, value in (("--gpus", self.gpus), ("--processes", self.processes), ("--view", self.viewing.view)):
+                if value:
+                    raise UserInputError(f"{name} with {self.tiling.asked}: not for tiles; leave one out")
 
     def launches(self, rasterizer: str) -> bool:
         """Run this command on several ranks if that is asked for; return whether it has.
@@ -114,6 +121,8 @@ def train(
         lapgs train data/garden -o runs/garden --resume --iterations 40000
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1
+
+        lapgs train data/town -o runs/town --hierarchy nested --tiles 2x3
     """
     from lapgs_plugin.training.preparation import TrainRequest, prepare
     from lapgs_plugin.training.ranks.group import joined
@@ -135,6 +144,8 @@ def train(
     )
     if isinstance(context.obj, float):
         request = replace(request, began=context.obj)
+    if not isinstance(context.obj, Rehearsal) and _trained_in_tiles(context, request, start.tiling):
+        return
     viewing = start.viewing if leads else ViewOptions()
     watcher = context.with_resource(watching(viewing, out.absolute().name))
     if isinstance(context.obj, Rehearsal):
@@ -152,9 +163,7 @@ def train(
     if not leads:
         return
     if request.settings.time is None:  # a preview is beyond the time
-        from lapgs_plugin.viewer.preview import save_run_preview
-
-        save_run_preview(out, moved_to=scene)
+        _save_preview(out, scene)
     _say_what_is_next(out)
 
 
@@ -176,8 +185,46 @@ def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str 
     return None
 
 
-def _train(run: PreparedRun, watcher: Watcher) -> None:
-    """Train with a progress display."""
+def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: TileOptions) -> bool:
+    """Train a run in tiles, or one tile, if that is asked for or was begun; return whether it was.
+
+    Raises:
+        UserInputError: a tile is asked for with options that its base has decided, or continued without its base.
+    """
+    from lapgs_plugin.runs.layout import require_room
+    from lapgs_plugin.tiles.grid import has_grid, read_grid
+    from lapgs_plugin.tiles.run import Tile, train_tile, train_tiles
+
+    out, scene, tell = Path(request.out), Path(request.scene), partial(say, stderr=True)
+
+    def started(run: PreparedRun, finest: int) -> None:
+        if run.archive.path() == out and tiling.tile is None:
+            _write_options(out / RUN_CONFIG, run, context)
+        _train(run, Watcher(), finest)
+
+    if tiling.base is not None:
+        require_options_of_base(request.chosen, tiling.base)
+        if not request.resume:
+            require_room(out, request.overwrite)
+        tile = Tile(tiling.base, scene, tiling.place)
+        train_tile(tile, out, request.control, started, tell, overwrite=request.overwrite)
+        return True
+    continues = request.resume and has_grid(out)
+    if continues and (only := read_grid(out).only) is not None:
+        raise UserInputError(
+            f"{out} is a tile of another run; continue it with --tile {only[0]},{only[1]} --base and that run"
+        )
+    if tiling.tiles is None and not continues:
+        return False
+    shape = None if tiling.tiles is None else tiling.shape
+    if train_tiles(request, shape, started, tell, only_base=tiling.only_base):
+        _save_preview(out, scene)
+        _say_what_is_next(out)
+    return True
+
+
+def _train(run: PreparedRun, watcher: Watcher, finest: int = 0) -> None:
+    """Train down to a level with a progress display."""
     from lapgs_plugin.training.monitor import ProgressMonitor
     from lapgs_plugin.training.tensorboard import TensorboardMonitor
     from lapgs_plugin.training.trainer import Trainer
@@ -189,7 +236,14 @@ def _train(run: PreparedRun, watcher: Watcher) -> None:
         monitor: Monitor = opened.enter_context(ProgressMonitor(make_console(stderr=True), run.plan.levels))
         if run.control.log is not None:
             monitor = opened.enter_context(TensorboardMonitor(run.archive.path(TENSORBOARD), run.plan, monitor))
-        Trainer(run, monitor=monitor, watcher=watcher).run()
+        Trainer(run, monitor=monitor, watcher=watcher, finest=finest).run()
+
+
+def _save_preview(out: Path, scene: Path) -> None:
+    """Save the picture of a finished run that the viewer shows first."""
+    from lapgs_plugin.viewer.preview import save_run_preview
+
+    save_run_preview(out, moved_to=scene)
 
 
 def _say_what_is_next(out: Path) -> None:

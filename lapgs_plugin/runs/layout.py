@@ -10,6 +10,8 @@
     RUN/checkpoint.pt              state of an unfinished stage, the latest
     RUN/history.jsonl              one JSON object a logging tick
     RUN/run.toml                   the options of `lapgs train` that made the run
+    RUN/tiles.json                 how the scene is divided, of a run with --tiles and of each of its tiles
+    RUN/tile_<r>_<c>/              run of the tile in row r and column c
     RUN/tensorboard/               its event files, with --log tensorboard
     RUN/preview.jpg                an image that the viewer shows until it can render
     RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   results of other commands
@@ -51,6 +53,7 @@ HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 CAMERAS = "view_cameras.json"
+TILES, TILE = "tiles.json", "tile_{}_{}"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
 GRIDS = "view_grids.pt"
@@ -152,10 +155,10 @@ def exists(path: Path) -> bool:
 
 def require_own_results(folder: Path) -> None:
     """Check that all that is written in a run folder is its own, see `files.require_own_entries`."""
-    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS)
+    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS, TILES)
     with one_line_errors(folder, "read"):
-        levels = [path.name for path in folder.glob("level_*")]
-    require_own_entries(folder, (*files, RENDERS, EXPORT, TENSORBOARD, CACHE, *levels))
+        parts = [path.name for pattern in ("level_*", TILE.format("*", "*")) for path in folder.glob(pattern)]
+    require_own_entries(folder, (*files, RENDERS, EXPORT, TENSORBOARD, CACHE, *parts))
 
 
 def is_run(folder: Path) -> bool:
@@ -191,7 +194,7 @@ def has_begun(folder: Path) -> bool:
 def remove_results(folder: Path) -> None:
     """Remove the files of a previous run and nothing else."""
     remove_scratch(folder)
-    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS):
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS, TILES):
         (folder / name).unlink(missing_ok=True)
     for name in (RENDERS, EXPORT, TENSORBOARD):
         if (folder / name).is_dir():
@@ -204,6 +207,12 @@ def remove_results(folder: Path) -> None:
                 waiting.unlink()
         if not any(level.iterdir()):
             level.rmdir()
+    for tile in filter(is_run, folder.glob(f"{TILE.format('*', '*')}/")):
+        remove_results(tile)
+        for name in (CHECKPOINT, MANIFEST, LOCK):
+            (tile / name).unlink(missing_ok=True)
+        if not any(tile.iterdir()):
+            tile.rmdir()
 
 
 def remove_scratch(folder: Path) -> None:

@@ -118,6 +118,15 @@ class View:
         """Return the view with another camera of the same size."""
         return View(self.name, camera, *(vars(self)[f"_{pixels}"] for pixels in ("image", "mask", "sky")))
 
+    def within(self, mask: Callable[[], Tensor]) -> View:
+        """Return the view whose image is ignored outside of another mask (1, h, w), too, which is made at each use."""
+
+        def both() -> Tensor:
+            own, other = self.mask, mask()
+            return other if own is None else own & other
+
+        return View(self.name, self.camera, vars(self)["_image"], both, vars(self)["_sky"])
+
 
 def with_pixels(views: Sequence[View]) -> Iterator[View]:
     """Yield views that hold their images. Threads read ahead those that are on the disk.

@@ -102,10 +102,15 @@ class ViewAppearance(ViewTransforms):
 
 
 class ViewColors(ViewAppearance):
-    """Hold and optimize an affine colour transform (3, 4) of each training view; their mean is the identity."""
+    """Hold and optimize an affine colour transform (3, 4) of each training view; their mean stays at `centre`.
+
+    Attributes:
+        centre: (3, 4), by default the identity.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.centre = torch.eye(3, 4, device=self.transforms.device)
         triton_works(self.transforms)  # compiles its kernels now, not in the first iteration
 
     @staticmethod
@@ -125,7 +130,7 @@ class ViewColors(ViewAppearance):
         return transform_colors(image, chosen[0] if image.ndim == 3 else chosen)
 
     def _recentre(self) -> None:
-        self.transforms.sub_(self.transforms.mean(dim=0) - torch.eye(3, 4, device=self.transforms.device))
+        self.transforms.sub_(self.transforms.mean(dim=0) - self.centre)
 
 
 class ViewGrids(ViewAppearance):

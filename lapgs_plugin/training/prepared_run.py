@@ -53,6 +53,7 @@ class PreparedRun(StagedRun):
         depth: of the training views; None without.
         normals: (3, h, w) of training views by name, as `load_normals` returns them.
         ranks: the processes that train it.
+        part_of_views: whether its views are only some of those that the coarser levels were trained on.
     """
 
     settings: TrainSettings
@@ -66,6 +67,7 @@ class PreparedRun(StagedRun):
     depth: DepthTargets | None
     normals: Mapping[str, Tensor]
     ranks: Ranks
+    part_of_views: bool = False
 
     @classmethod
     def of(

@@ -22,7 +22,7 @@ from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
 from lapgs_plugin.scenes.scene import View, with_pixels
-from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, from_gains, identities
+from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, ViewColors, from_gains, identities
 from lapgs_plugin.stages.geometry import StageGeometry, at_level, depths_of, skies_of
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.training.checkpoint import check_moments
@@ -169,7 +169,10 @@ def first_appearance(
     if start is None:
         return None
     done = run.plan.iterations_before(stage.level)
-    return kind.create(names, start, run.device, done, run.plan.iterations)
+    appearance = kind.create(names, start, run.device, done, run.plan.iterations)
+    if run.part_of_views and isinstance(appearance, ViewColors):  # the identity is the mean of all views
+        appearance.centre = start.mean(dim=0).to(run.device)
+    return appearance
 
 
 def _measured_colors(run: PreparedRun, monitor: Monitor) -> Tensor | None:

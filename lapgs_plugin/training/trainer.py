@@ -60,6 +60,7 @@ class Trainer:
         monitor: shows progress.
         watcher: looks at the fields between iterations.
         clock: returns seconds, those of `PreparedRun.began`.
+        finest: level after which the run stops, to be continued.
     """
 
     prepared: PreparedRun
@@ -67,6 +68,7 @@ class Trainer:
     monitor: Monitor = field(default_factory=Monitor)
     watcher: Watcher = field(default_factory=Watcher)
     clock: Callable[[], float] = time.monotonic
+    finest: int = 0
 
     def __post_init__(self) -> None:
         settings = self.prepared.settings
@@ -97,7 +99,7 @@ class Trainer:
                 self.watcher.run_started(archive)
                 if not prepared.resumes:
                     self._say_what_is_chosen()
-                for level in reversed(range(prepared.plan.levels)):
+                for level in reversed(range(self.finest, prepared.plan.levels)):
                     stage = self.prepared.plan[level]
                     if stage.level in archive.available_levels and prepared.record_to_extend(stage) is None:
                         continue

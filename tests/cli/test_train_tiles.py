@@ -1,0 +1,136 @@
+"""`lapgs train --tiles`: the base, the tiles and their merge, in one process or by their own commands."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from lapgs_plugin.cli import app
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.files import MANIFEST
+from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import EXPOSURE, PLY, TILES
+from lapgs_plugin.scenes.sample import make_sample_scene
+from lapgs_plugin.tiles.grid import read_grid
+
+OPTIONS = ("--iterations", "40", "--sh-degree", "1", "--hierarchy", "nested", "--eval", "--appearance", "affine")
+TILE_FOLDERS = ("tile_0_0", "tile_0_1")
+
+Lapgs = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "sample"
+    make_sample_scene(path, width=64, height=48, views=10, points=300, progress=False)
+    return path
+
+
+@pytest.fixture
+def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Lapgs:
+    """Return a function that runs a command in this process, and returns its messages; it fails if `fails`."""
+
+    def call(*words: object, fails: bool = False) -> str:
+        monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            app.run()
+        messages = capsys.readouterr().err
+        assert ended.value.code == (2 if fails else 0), messages
+        return messages
+
+    return call
+
+
+def fields_of(run: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(run.glob(f"**/{PLY}"))]
+
+
+def tile_commands(messages: str) -> list[list[str]]:
+    return [shlex.split(line)[1:] for line in messages.splitlines() if line.startswith("lapgs train ")]
+
+
+def test_tiles_end_as_one_run(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2")
+    archive, grid = RunArchive.open(run), read_grid(run)
+    assert archive.manifest.complete
+    parts = []
+    for tile, folder in zip(grid, TILE_FOLDERS, strict=True):
+        trained = GaussianField.load_ply(run / folder / "level_0" / PLY)
+        cut = trained.means.double() @ torch.tensor(grid.across).double() >= grid.column_cuts[0][0]
+        parts.append(trained.kept(cut if tile == (0, 1) else ~cut))
+    merged = archive.field(0)
+    assert torch.equal(merged.means, torch.cat([part.means for part in parts]))
+    assert torch.equal(merged.sh, torch.cat([part.sh for part in parts]))
+    colors, *of_tiles = (
+        json.loads((run / folder / EXPOSURE).read_text())
+        for folder in ("level_0", *(f"{each}/level_0" for each in TILE_FOLDERS))
+    )
+    for photo, color in colors.items():
+        learned = torch.tensor([own[photo] for own in of_tiles if photo in own], dtype=torch.float64)
+        assert torch.allclose(torch.tensor(color, dtype=torch.float64), learned.mean(0), rtol=0, atol=1e-12)
+    lapgs("eval", run)
+    assert json.loads((run / "metrics.json").read_text())
+    finished = fields_of(run)
+    assert "is finished" in lapgs("train", scene, "-o", run, "--resume")
+    assert fields_of(run) == finished
+
+    # The same by a command for each tile, of which one is left to --resume.
+    queue = tmp_path / "queue"
+    commands = tile_commands(lapgs("train", scene, "-o", queue, *OPTIONS, "--tiles", "1x2", "--only-base"))
+    assert len(commands) == 2
+    assert not list(queue.glob("tile_*"))
+    lapgs(*commands[1])
+    first = (queue / "tile_0_1" / MANIFEST).stat().st_mtime_ns
+    lapgs("train", scene, "-o", queue, "--resume", "--tiles", "1x2")
+    assert (queue / "tile_0_1" / MANIFEST).stat().st_mtime_ns == first
+    assert fields_of(queue) == finished
+
+    assert "--tile 0,1 --base" in lapgs("train", scene, "-o", run / "tile_0_1", "--resume", fails=True)
+    assert "merged already" in lapgs("train", scene, "-o", tmp_path / "t", "--tile", "0,1", "--base", run, fails=True)
+    assert "not extended" in lapgs("train", scene, "-o", run, "--resume", "--iterations", "60", fails=True)
+    assert fields_of(run) == finished
+
+
+def test_a_tile_without_views_keeps_the_base(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2", "--only-base")
+    base = RunArchive.open(run).field(1)
+    values = json.loads((run / TILES).read_text())
+    # Between the two outermost Gaussians of one side: the tile beyond has one of them, too small to be seen.
+    places = (base.means.double() @ torch.tensor(values["across"]).double()).sort().values
+    (run / TILES).write_text(json.dumps({**values, "column_cuts": [[float(places[-1] + 1.0)]]}))
+    assert "tile 0,1: fewer than 2 training views" in lapgs("train", scene, "-o", run, "--resume")
+    assert not (run / "tile_0_1").exists()
+    assert RunArchive.open(run).manifest.complete
+
+
+def test_bad_requests(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run, other, out = tmp_path / "run", tmp_path / "other", tmp_path / "out"
+    assert "--hierarchy nested" in lapgs("train", scene, "-o", out, "--tiles", "1x2", fails=True)
+    assert "--levels 1" in lapgs("train", scene, "-o", out, *OPTIONS, "--levels", "1", "--tiles", "1x2", fails=True)
+    assert "--gpus" in lapgs("train", scene, "-o", out, *OPTIONS, "--tiles", "1x2", "--gpus", "2", fails=True)
+    assert "--refine-poses" in lapgs(
+        "train", scene, "-o", out, *OPTIONS, "--tiles", "2x1", "--refine-poses", fails=True
+    )
+    lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2", "--only-base")
+    tile = ("--tile", "0,1", "--base", run)
+    assert "has 1x2 tiles" in lapgs("train", scene, "-o", out, "--tile", "0,2", "--base", run, fails=True)
+    assert "--iterations with --tile" in lapgs("train", scene, "-o", out, *tile, "--iterations", "9", fails=True)
+    assert "no run with --tiles" in lapgs("train", scene, "-o", out, "--tile", "0,1", "--base", scene, fails=True)
+    make_sample_scene(other, width=64, height=48, views=10, points=300, seed=1, progress=False)
+    assert "was started with the scene" in lapgs("train", other, "-o", out, *tile, fails=True)
+    assert "was started with 1x2" in lapgs("train", scene, "-o", run, "--resume", "--tiles", "2x2", fails=True)
+    assert not out.exists()
+
+    # A tile of a run with other settings is not merged.
+    lapgs("train", scene, "-o", tmp_path / "seed", *OPTIONS, "--seed", "1", "--tiles", "1x2", "--only-base")
+    lapgs("train", scene, "-o", run / "tile_0_1", "--tile", "0,1", "--base", tmp_path / "seed")
+    assert "a tile of another run" in lapgs("train", scene, "-o", run, "--resume", fails=True)
+    assert not RunArchive.open(run).manifest.complete
