@@ -86,6 +86,7 @@ def train_tiles(
         only_base: end before the tiles, after their commands were shown.
 
     Raises:
+        UserInputError: no tile is seen by enough views.
         LapgsError: as `prepare` and `train`; tiles of another run are in its folder.
     """
     out, scene = Path(request.out), Path(request.scene)
@@ -111,6 +112,11 @@ def train_tiles(
     if only_base:
         return False
     unseen = {tile.place for tile in tiles if not train_tile(tile, tile.folder, request.control, train, say)}
+    if len(unseen) == len(tiles):
+        raise UserInputError(
+            f"{out}: fewer than {LEAST_VIEWS} training views see each of its {grid.text} tiles, so that nothing was "
+            "trained beyond the base; start again with --overwrite and fewer tiles"
+        )
     _merge(out, grid, unseen)
     return True
 
@@ -141,8 +147,9 @@ def train_tile(
     if before is not None and before.manifest.complete:
         return True
     resumes = before is not None and SHARED in before.available_levels
-    inside = grid.contains(tile.place, base.field(SHARED).means)
-    seen = _views(base, tile, inside, control)
+    shared = base.field(SHARED)
+    inside = grid.contains(tile.place, shared.means)
+    seen = _views(base, tile, shared, inside, control)
     if sum(name in seen.masks for name in run_cameras(base, tile.scene)[0]) < LEAST_VIEWS:
         say(f"tile {tile.name}: fewer than {LEAST_VIEWS} training views see it, so it keeps level {SHARED}'s field")
         return False
@@ -158,7 +165,7 @@ def train_tile(
     with prepare(request, say) as run:
         if not resumes:
             replace(grid, only=tile.place).save(run.archive.path())
-            _adopt(run.archive, base, inside | seen.seen)
+            _adopt(run.archive, base, shared, inside | seen.seen)
         train(_seen_by(run, seen), 0)
     return True
 
@@ -179,8 +186,8 @@ def _require_base(base: RunArchive, scene: Path) -> None:
         raise UserInputError(f"{scene}: the run in {base.path()} was started with the scene {before}; give that one")
 
 
-def _views(base: RunArchive, tile: Tile, inside: Tensor, control: TrainingControl) -> TileViews:
-    """Return what the views of a run see of a tile."""
+def _views(base: RunArchive, tile: Tile, shared: GaussianField, inside: Tensor, control: TrainingControl) -> TileViews:
+    """Return what the views of a run see of a tile, which has those Gaussians of the shared field that are `inside`."""
     settings = settings_from_manifest(base.manifest, str(base.path()))
     placed = training_rasterizer(
         base.manifest.rasterizer if control.rasterizer == AUTO else control.rasterizer, settings
@@ -189,7 +196,7 @@ def _views(base: RunArchive, tile: Tile, inside: Tensor, control: TrainingContro
     rasterizer = in_unit(placed.rasterizer, base.manifest.scene.unit)
     cameras: Mapping[str, Camera] = {**train, **test}
     with one_pool():
-        return views_of_tile(cameras, base.field(SHARED), inside, rasterizer, placed.device)
+        return views_of_tile(cameras, shared, inside, rasterizer, placed.device)
 
 
 def _seen_by(run: PreparedRun, seen: TileViews) -> PreparedRun:
@@ -226,20 +233,22 @@ def _options_of(scene: SceneReference) -> SceneOptions:
     )
 
 
-def _adopt(archive: RunArchive, base: RunArchive, kept: Tensor) -> None:
+def _adopt(archive: RunArchive, base: RunArchive, shared: GaussianField, kept: Tensor) -> None:
     """Copy the shared levels into a tile's run, of the finest only some Gaussians: those in the tile and in its views.
 
     Args:
         archive: of the tile.
         base: the run that has the levels.
-        kept: (n,) bool, Gaussians of level `SHARED`.
+        shared: field of level `SHARED`.
+        kept: (n,) bool, which of its Gaussians.
     """
     for level in base.available_levels:
-        field, moments = base.field(level), None
         if level == SHARED:
             moments = base.optimizer_state(SHARED)
-            check_moments(moments, field, base.path())
-            field, moments = field.kept(kept), _rows_of(moments, kept)
+            check_moments(moments, shared, base.path())
+            field, moments = shared.kept(kept), _rows_of(moments, kept)
+        else:
+            field, moments = base.field(level), None
         record = replace(base.manifest.record(level), num_gaussians=len(field))
         archive.finish_level(record, field, moments, exposure=base.exposure(level))
 

@@ -111,6 +111,16 @@ def test_a_tile_without_views_keeps_the_base(tmp_path: Path, scene: Path, lapgs:
     assert RunArchive.open(run).manifest.complete
 
 
+def test_tiles_that_no_view_sees_are_refused_before_they_are_merged(
+    tmp_path: Path, scene: Path, lapgs: Lapgs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lapgs_plugin.tiles.visibility.LEAST_PIXELS", 1.1)  # as very many tiles are small
+    run = tmp_path / "run"
+    messages = lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2", fails=True)
+    assert "see each of its 1x2 tiles" in messages
+    assert not RunArchive.open(run).manifest.complete
+
+
 def test_bad_requests(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
     run, other, out = tmp_path / "run", tmp_path / "other", tmp_path / "out"
     assert "--hierarchy nested" in lapgs("train", scene, "-o", out, "--tiles", "1x2", fails=True)
