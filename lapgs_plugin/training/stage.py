@@ -411,10 +411,10 @@ class StageRun:
         kept = loss.detach()
         if result is not None:
             result = replace(result, image=kept, transmittance=None)
-        if self._device.type == "cpu":  # at once, before a loss that is not finite does harm
-            self._require_finite_loss(kept.item(), last)
         if not self._reads_late:
             self._note_loss(kept.item(), last, len(views))
+        elif self._device.type == "cpu":  # at once, before a loss that is not finite does harm
+            self._require_finite_loss(kept.item(), last)
         self._breakdown.mark("backward")
         with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
             # The gradient of the sum of the views' losses; for one view, the default of `backward`.
