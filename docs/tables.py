@@ -46,9 +46,9 @@ def runs_of(name: str) -> Runs:
 
 
 def mean(runs: Runs, column: str) -> float | None:
-    """Return the mean of a column over runs; None if one of them lacks it."""
-    values = [run[column] for run in runs]
-    return fmean(map(float, values)) if values and all(values) else None
+    """Return the mean of a column over the runs that have it; None if none has."""
+    values = [float(run[column]) for run in runs if run[column]]
+    return fmean(values) if values else None
 
 
 def shown(value: float | None, form: str) -> str:
@@ -100,21 +100,26 @@ def train() -> str:
     return compared("train", "one field", scene_title, ("scene",), with_fit=True)
 
 
-def checkouts(ours: bool, fastgs: bool | None = None) -> str:
-    """Return checkouts under `lapgs run` beside their own scripts.
+def ours() -> str:
+    """Return checkouts that our rasterizer renders beside their own scripts, one a row."""
+    columns = {"PSNR": ("psnr", "{:.2f} dB"), "peak": ("peak_gb", "{:.2f} GB")}
+    methods = [method for method in METHODS if method != "FastGS"]
+    rows = []
+    runs = [run for run in runs_of("checkouts") if run["options"] == OURS]
+    for (checkout, scene), groups in grouped(runs, "checkout", "scene").items():
+        cells = [measured(groups[method], groups["own script"], columns) for method in methods]
+        rows.append([checkout, scene, *(f"{cell[0]} s, " + ", ".join(filter(None, cell[1:])) for cell in cells)])
+    return markdown(["", "scene", *methods], rows)
 
-    Args:
-        ours: those that our rasterizer renders, or those with their own.
-        fastgs: FastGS alone, or the others; None for all.
-    """
+
+def checkouts(fastgs: bool) -> str:
+    """Return checkouts with their own rasterizer under `lapgs run` beside their own scripts: FastGS, or the others."""
 
     def title(run: Run) -> str:
-        options = "" if ours or not run["options"] else f", `{run['options']}`"
+        options = f", `{run['options']}`" if run["options"] else ""
         return f"{run['checkout']}, {run['scene']}{options} ({run['gpu']}, {run['date']})"
 
-    runs = [run for run in runs_of("checkouts") if (run["options"] == OURS) == ours]
-    if fastgs is not None:
-        runs = [run for run in runs if (run["checkout"] == "FastGS") == fastgs]
+    runs = [run for run in runs_of("checkouts") if run["options"] != OURS and (run["checkout"] == "FastGS") == fastgs]
     columns = {title: QUALITY[title] for title in ("PSNR (dB)", "LPIPS")} | {"peak GB": COST["peak GB"]}
     rows = []
     for methods in grouped(runs, "checkout", "scene").values():
@@ -137,9 +142,9 @@ def cpu() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "train": train,
-    "ours": lambda: checkouts(ours=True),
-    "fastgs": lambda: checkouts(ours=False, fastgs=True),
-    "forks": lambda: checkouts(ours=False, fastgs=False),
+    "ours": ours,
+    "fastgs": lambda: checkouts(fastgs=True),
+    "forks": lambda: checkouts(fastgs=False),
     "cpu": cpu,
 }
 
