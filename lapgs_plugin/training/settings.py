@@ -41,6 +41,9 @@ LAST = "last"
 BEST = "best"
 """Choice of --keep: the state whose held-out views were best."""
 
+PLANNED = "planned"
+"""Choice of --stop: after the iterations that a stage was planned with."""
+
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
 
@@ -173,6 +176,13 @@ class TrainSettings(HierarchySettings):
         "last level's end. Each level gets its --split of the seconds.",
         metavar="DURATION",
     )
+    stop: str = option(
+        PLANNED,
+        "When a level ends. planned: after its --split of --iterations. auto: when training views that are set aside, "
+        "one of 16, stop gaining PSNR, and after its --split at the latest. Once the end of the finest level is "
+        "decided, it trains on them, too.",
+        choices=(PLANNED, AUTO),
+    )
     accumulate_views: int = option(
         8,
         "Views whose gradients are added up for each optimizer step in the last quarter of a stage, once densification "
@@ -285,12 +295,26 @@ class TrainSettings(HierarchySettings):
                     f"--densify-until {self.densification.until} with --time: names an iteration of a run whose length "
                     "is not known; leave one out"
                 )
+        if self.stops_early:
+            self._check_open_end()
         if not 0.0 < self.decay <= 1.0:
             raise UserInputError(f"--decay {self.decay}: expected a share of each stage above 0 and at most 1")
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
             raise UserInputError(f"--dropout {self.dropout}: expected a share from 0 to below 1, such as 0.2")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"ssim_weight is {self.ssim_weight}, expected 0 (only L1) to 1 (only SSIM)")
+
+    def _check_open_end(self) -> None:
+        """Refuse settings that contradict levels whose length views that are set aside decide."""
+        if (until := self.densification.until) is not None:
+            raise UserInputError(
+                f"--densify-until {until} with --stop auto: names an iteration of a run whose length is not known; "
+                "leave one out"
+            )
+        if self.keep == BEST:
+            raise UserInputError("--keep best with --stop auto: both set training views aside; leave one out")
+        if self.extended:
+            raise UserInputError(f"extended {self.extended}: expected 0 with --stop auto")
 
     def _choose_strategy(self) -> None:
         """Replace the strategy auto by the one that it means here.
@@ -357,7 +381,8 @@ class TrainSettings(HierarchySettings):
         """
         enough, control = enough_iterations(count), self.densification
         timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
-        if enough >= self.iterations or timed or self.protocol == "paper" or self.time is not None:
+        open_end = self.time is not None or self.stops_early
+        if enough >= self.iterations or timed or self.protocol == "paper" or open_end:
             return self
         return replace(self, iterations=enough)
 
@@ -384,6 +409,11 @@ class TrainSettings(HierarchySettings):
         if large is None or not is_large(size) or self.split is not None or self.nested or self.levels != 2:
             return self
         return replace(self, split=large)
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether views that are set aside decide the lengths of levels; a run that gets a time ends with that."""
+        return self.stop == AUTO and self.time is None
 
     @property
     def scheduled(self) -> int:
@@ -463,6 +493,7 @@ class TrainSettings(HierarchySettings):
                 "views_per_step": "1",
                 "sh_rate_factor": 1.0,
                 "decay": 1.0,
+                "stop": PLANNED,
                 "appearance": NONE,
                 "depth": NONE,
                 "normals": NONE,

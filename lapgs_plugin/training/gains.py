@@ -1,0 +1,143 @@
+"""End a stage when training views that are set aside stop gaining: `--stop auto`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import fmean, median
+from typing import Any
+
+from lapgs_plugin.runs.manifest import DecidedLength
+
+LEAST_PHOTOS = 10
+"""Fewest training views of which some can be set aside."""
+PHOTOS_OF_ONE = 16
+"""One of so many training views is set aside, within the next two bounds."""
+FEWEST_ASIDE = 3
+"""Fewest views that are set aside."""
+MOST_ASIDE = 12
+"""Most views that are set aside."""
+
+FIRST_SHARE = 0.25
+"""Share of its most iterations that the coarsest level is planned with at first."""
+DECAY_FROM = 0.6
+"""Share of a stage's iterations, at least, after which its length is decided. The rest is its decay."""
+LEAST_SHARE = 1 / 16
+"""Share of its most iterations before which a stage's length is not decided."""
+LOOK_SHARE = 1 / 16
+"""Share of the iterations so far between two measurements."""
+MOST_LOOKS = 256
+"""A stage's most iterations, divided by the fewest between two measurements."""
+WINDOW = 0.5
+"""Share of the iterations so far, the last ones, whose measurements count."""
+LEAST_LOOKS = 6
+"""Fewest measurements from which gains are extrapolated."""
+MORE = 4 / 3
+"""Factor on the iterations so far up to which gains are extrapolated."""
+LEAST_GAIN = 0.1
+"""Decibels that views should gain by then for a stage to go on."""
+FALLEN = 1 / 3
+"""Share of the highest gain so far that they should gain at least, in its first iterations, when gains still rise."""
+
+
+def views_to_set_aside(photos: int) -> int:
+    """Return how many of so many training views are set aside.
+
+    >>> [views_to_set_aside(photos) for photos in (10, 43, 112, 255)]
+    [3, 3, 7, 12]
+    """
+    return min(MOST_ASIDE, max(FEWEST_ASIDE, photos // PHOTOS_OF_ONE))
+
+
+@dataclass
+class StageGains:
+    """Plan the iterations of a stage by the PSNR of views that are set aside.
+
+    The rates of a stage fall with the share of its planned iterations that is done. The plan grows with the stage, so
+    that this share stays at `DECAY_FROM` as long as views gain enough. Then it stays, and the rates fall to their ends.
+
+    A gain is extrapolated as linear in the logarithm of the iteration, by least squares, for each view by itself. The
+    median over the views decides.
+
+    Attributes:
+        most: iterations of the stage.
+        planned: iterations, so far.
+        looks: iteration and PSNR of each view in dB of all measurements.
+        decided: iteration after which the plan was decided; None before.
+        expected: gain in dB within the next third of the iterations, as of the last measurement; None if too few are
+            there.
+        highest: the highest of these gains so far, at least 0.
+    """
+
+    most: int
+    planned: int
+    looks: list[tuple[int, list[float]]] = field(default_factory=list)
+    decided: int | None = None
+    expected: float | None = None
+    highest: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._reach_next_look()
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether the views are to be measured after an iteration."""
+        return self.decided is None and iteration >= self._next_look
+
+    def note(self, iteration: int, psnrs: Sequence[float]) -> None:
+        """Note the PSNR of the views after an iteration, and plan the stage anew."""
+        self.looks.append((iteration, list(psnrs)))
+        self.expected = self._extrapolated()
+        self.highest = max(self.highest, self.expected or 0.0)
+        ends = math.ceil(iteration / DECAY_FROM)
+        if ends >= self.most:
+            self.planned, self.decided = self.most, iteration
+        elif iteration >= LEAST_SHARE * self.most and self._stopped_gaining():
+            self.planned, self.decided = ends, iteration
+        else:
+            self._reach_next_look()
+
+    @property
+    def length(self) -> DecidedLength | None:
+        """Why the stage has `planned` iterations; None before that is decided."""
+        if self.decided is None:
+            return None
+        return DecidedLength(self.most, self.decided, len(self.looks[-1][1]), self.expected)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that was measured and decided."""
+        return {
+            "planned": self.planned,
+            "looks": [(iteration, list(psnrs)) for iteration, psnrs in self.looks],
+            "decided": self.decided,
+            "expected": self.expected,
+            "highest": self.highest,
+        }
+
+    def _stopped_gaining(self) -> bool:
+        """Return whether views are expected to gain little, and less than before: at first, gains rise."""
+        return self.expected is not None and self.expected < min(LEAST_GAIN, FALLEN * self.highest)
+
+    def _reach_next_look(self) -> None:
+        """Plan enough iterations for another measurement before the decay."""
+        if self.decided is None:
+            self.planned = min(self.most, max(self.planned, math.ceil(self._next_look / DECAY_FROM)))
+
+    @property
+    def _next_look(self) -> int:
+        """The first iteration after which the views are measured again."""
+        last = self.looks[-1][0] if self.looks else 0
+        return last + max(1, math.ceil(self.most / MOST_LOOKS), math.ceil(LOOK_SHARE * last))
+
+    def _extrapolated(self) -> float | None:
+        """Return the median of the views' gains up to `MORE` times the iterations so far; None if few were measured."""
+        last = self.looks[-1][0]
+        looks = [(math.log(iteration), psnrs) for iteration, psnrs in self.looks if iteration >= (1.0 - WINDOW) * last]
+        if len(looks) < LEAST_LOOKS:
+            return None
+        centre = fmean(time for time, _ in looks)
+        spread = sum((time - centre) ** 2 for time, _ in looks)
+        slopes = [
+            sum((time - centre) * psnrs[view] for time, psnrs in looks) / spread for view in range(len(looks[0][1]))
+        ]
+        return math.log(MORE) * median(slopes)

@@ -1,0 +1,117 @@
+"""Lengths of stages by views that are set aside: curves whose best length is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.training.gains import DECAY_FROM, LEAST_GAIN, StageGains, views_to_set_aside
+from lapgs_plugin.training.planning import make_plan
+from lapgs_plugin.training.quality import set_aside_to_stop
+from lapgs_plugin.training.settings import Densification, TrainSettings
+
+Curve = Callable[[int], list[float]]
+
+
+def trained(gains: StageGains, curve: Curve, step: int = 1, done: int = 0) -> int:
+    """Return the iterations of a stage whose views have the PSNR of a curve, in steps of so many iterations."""
+    while done < gains.planned:
+        done = min(done + step, gains.planned)
+        if gains.is_due(done):
+            gains.note(done, curve(done))
+    return done
+
+
+def flat_after(iteration: int) -> Curve:
+    """Return views that gain 3 dB for each doubling, up to an iteration."""
+    return lambda done: [level + 3.0 * math.log2(min(done, iteration)) for level in (5.0, 8.0, 20.0)]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 3_000), st.integers(1, 8), st.integers(1, 1_000))
+def test_views_that_go_on_gaining_get_all_iterations(most: int, step: int, planned: int) -> None:
+    gains = StageGains(most, min(most, planned))
+    assert trained(gains, flat_after(most), step) == most
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(2_000, 6_000), st.sampled_from([1, 3, 8]), st.sampled_from([1_000, 4_000, 15_000]))
+def test_a_stage_ends_soon_after_its_views_stopped_gaining(end: int, step: int, planned: int) -> None:
+    gains = StageGains(30_000, planned)
+    length = trained(gains, flat_after(end), step)
+    assert gains.decided is not None
+    assert end < gains.decided < 2.1 * end  # half of the iterations so far count; 1.91 to 2.0 seen
+    assert length == math.ceil(gains.decided / DECAY_FROM)
+    assert gains.expected is not None
+    assert gains.expected < LEAST_GAIN
+
+
+def test_one_view_that_gets_worse_does_not_decide() -> None:
+    gains = StageGains(8_000, 2_000)
+    assert trained(gains, lambda done: [20.0 - done / 500, *flat_after(8_000)(done)]) == 8_000
+
+
+def test_views_that_get_worse_end_a_stage() -> None:
+    gains = StageGains(30_000, 7_500)
+    assert trained(gains, lambda done: [20.0 - math.log(done)] * 4) < 4_000
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(2.0, 9.0), st.floats(0.0, 0.3))
+def test_the_share_that_is_done_stays_until_the_length_is_decided(gain: float, noise: float) -> None:
+    """So the rates stay, too, and then fall to their ends."""
+    gains = StageGains(20_000, 1_000)
+    shares = []
+
+    def curve(done: int) -> list[float]:
+        shares.append(done / gains.planned)
+        return [gain * math.log(done) + noise * math.sin(done)] * 3
+
+    trained(gains, curve)
+    assert max(shares[:-1]) <= DECAY_FROM + 1e-9
+    assert min(shares[40:]) > 0.9 * DECAY_FROM
+
+
+def test_what_was_measured_and_decided_continues() -> None:
+    whole = StageGains(9_000, 3_000)
+    length = trained(whole, flat_after(1_500))
+    for stop in (10, 1_200, 2_000, length - 1):
+        part = StageGains(9_000, 3_000)
+        done = 0
+        while done < stop:
+            done += 1
+            if part.is_due(done):
+                part.note(done, flat_after(1_500)(done))
+        again = StageGains(9_000, **part.state())
+        assert trained(again, flat_after(1_500), done=stop) == length
+        assert again == whole
+
+
+@pytest.mark.parametrize(("photos", "aside"), [(10, 3), (63, 3), (64, 4), (300, 12)])
+def test_views_that_are_set_aside_are_spread(photos: int, aside: int) -> None:
+    assert views_to_set_aside(photos) == aside
+    chosen = set_aside_to_stop(list(range(photos)))
+    assert len(set(chosen)) == aside
+    gaps = [after - before for before, after in zip([-1, *chosen], [*chosen, photos], strict=True)]
+    assert max(gaps[1:-1]) - min(gaps[1:-1]) <= 1
+
+
+def test_too_few_photos_are_refused() -> None:
+    stops_early = TrainSettings(stop="auto")
+    make_plan((56, 40), stops_early, 10)
+    with pytest.raises(UserInputError, match=r"--stop auto: .* the scene has 9 of them, expected at least 10"):
+        make_plan((56, 40), stops_early, 9)
+
+
+def test_settings_that_need_a_known_length_are_refused() -> None:
+    with pytest.raises(UserInputError, match=r"--densify-until 500 with --stop auto: .* leave one out"):
+        TrainSettings(stop="auto", densification=Densification(until=500))
+    with pytest.raises(UserInputError, match="--keep best with --stop auto: both set training views aside"):
+        TrainSettings(stop="auto", keep="best")
+    with pytest.raises(UserInputError, match="--protocol paper"):
+        TrainSettings(stop="auto", protocol="paper")
