@@ -12,7 +12,7 @@ from lapgs_plugin.runs.manifest import DecidedLength
 
 LEAST_PHOTOS = 10
 """Fewest training views of which some can be set aside."""
-PHOTOS_OF_ONE = 16
+PHOTOS_OF_ONE = 10
 """One of so many training views is set aside, within the next two bounds."""
 FEWEST_ASIDE = 3
 """Fewest views that are set aside."""
@@ -23,8 +23,8 @@ FIRST_SHARE = 0.25
 """Share of its most iterations that the coarsest level is planned with at first."""
 DECAY_FROM = 0.6
 """Share of a stage's iterations, at least, after which its length is decided. The rest is its decay."""
-LEAST_SHARE = 1 / 16
-"""Share of its most iterations before which a stage's length is not decided."""
+LEAST_SHARE = 1 / 8
+"""Share of its most iterations before which a stage's length is not decided: at first, views differ in their gains."""
 LOOK_SHARE = 1 / 16
 """Share of the iterations so far between two measurements."""
 MOST_LOOKS = 256
@@ -45,7 +45,7 @@ def views_to_set_aside(photos: int) -> int:
     """Return how many of so many training views are set aside.
 
     >>> [views_to_set_aside(photos) for photos in (10, 43, 112, 255)]
-    [3, 3, 7, 12]
+    [3, 4, 11, 12]
     """
     return min(MOST_ASIDE, max(FEWEST_ASIDE, photos // PHOTOS_OF_ONE))
 

@@ -113,8 +113,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
         LapgsError: the request, the scene, the run folder or the machine does not allow the run.
     """
     photos, settings, ranks = request.photos, request.settings, request.ranks
-    if settings.stops_early and ranks.size > 1:
-        raise UserInputError(f"{ranks.together}, with --stop auto: ends runs of one process alone; leave one out")
+    _require_one_process(ranks, settings)
     say = say if ranks.leads else _silent
     require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
     depth = resolve_depth(Path(request.scene), settings.depth)
@@ -159,9 +158,10 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
         _require_views(ranks, photos)
         if "iterations" not in request.chosen and (fewer := settings.for_photos(photos)) != settings:
             settings = fewer
+            most = "at most " if settings.stops_early else ""
             say(
-                f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
-                "over them; more gain little, and --iterations asks for another number"
+                f"{photos} training photos: {most}{settings.iterations:,} iterations, {settings.iterations // photos} "
+                "passes over them; more gain little, and --iterations asks for another number"
             )
         if settings.time is not None:  # how long it may be is measured once the photos are read
             make_plan(size, settings, photos)
@@ -271,6 +271,7 @@ def _continued_settings(
     """
     out, manifest, chosen = Path(request.out), archive.manifest, request.chosen
     settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
+    _require_one_process(request.ranks, settings)
     if manifest.complete:
         asked = request.settings.iterations if "iterations" in chosen else None
         _require_untimed(out, settings, request.settings, asked)
@@ -326,6 +327,12 @@ def _require_views(ranks: Ranks, photos: int) -> None:
     """Refuse more ranks than training photos."""
     if ranks.size > photos:
         raise UserInputError(f"{ranks.together}: the scene has {photos} training photos; give at most so many ranks")
+
+
+def _require_one_process(ranks: Ranks, settings: TrainSettings) -> None:
+    """Refuse ranks with --stop auto: views that are given back would belong to other ranks than before."""
+    if settings.stops_early and ranks.size > 1:
+        raise UserInputError(f"{ranks.together} with --stop auto: ends runs of one process alone; leave one out")
 
 
 def _require_same_run(ranks: Ranks, scene: Scene, settings: TrainSettings) -> None:

@@ -55,15 +55,17 @@ PASSES = 130
 """Passes over the training photos in a run whose iterations are left open, unless they are more than 3DGS's 30,000.
 
 More passes sharpen renders a little, and cost PSNR where photos are few or their exposure changes."""
+MOST_PASSES = 300
+"""The same with --stop auto, which may end the run earlier."""
 
 
-def enough_iterations(photos: int) -> int:
+def enough_iterations(photos: int, passes: int = PASSES) -> int:
     """Return the iterations after which more gain little on so many training photos, and no fewer than a long run has.
 
     >>> enough_iterations(43), enough_iterations(10)
     (5590, 5000)
     """
-    return max(LONG_RUN, PASSES * photos)
+    return max(LONG_RUN, passes * photos)
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class TrainSettings(HierarchySettings):
     stop: str = option(
         PLANNED,
         "When a level ends. planned: after its --split of --iterations. auto: when training views that are set aside, "
-        "one of 16, stop gaining PSNR, and after its --split at the latest. Once the end of the finest level is "
+        "one of 10, stop gaining PSNR, and after its --split at the latest. Once the end of the finest level is "
         "decided, it trains on them, too.",
         choices=(PLANNED, AUTO),
     )
@@ -377,12 +379,13 @@ class TrainSettings(HierarchySettings):
     def for_photos(self, count: int) -> TrainSettings:
         """Return settings with `PASSES` over the photos, but no shorter than a long run and no longer than these.
 
+        With --stop auto they are `MOST_PASSES`.
+
         Settings of the paper, and of a schedule in iterations of the run, stay.
         """
-        enough, control = enough_iterations(count), self.densification
+        enough, control = enough_iterations(count, MOST_PASSES if self.stops_early else PASSES), self.densification
         timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
-        open_end = self.time is not None or self.stops_early
-        if enough >= self.iterations or timed or self.protocol == "paper" or open_end:
+        if enough >= self.iterations or timed or self.protocol == "paper" or self.time is not None:
             return self
         return replace(self, iterations=enough)
 

@@ -58,7 +58,7 @@ def test_one_view_that_gets_worse_does_not_decide() -> None:
 
 def test_views_that_get_worse_end_a_stage() -> None:
     gains = StageGains(30_000, 7_500)
-    assert trained(gains, lambda done: [20.0 - math.log(done)] * 4) < 4_000
+    assert trained(gains, lambda done: [20.0 - math.log(done)] * 4) < 7_000  # of these, an eighth at least before
 
 
 @settings(deadline=None, max_examples=10)
@@ -92,7 +92,7 @@ def test_what_was_measured_and_decided_continues() -> None:
         assert again == whole
 
 
-@pytest.mark.parametrize(("photos", "aside"), [(10, 3), (63, 3), (64, 4), (300, 12)])
+@pytest.mark.parametrize(("photos", "aside"), [(10, 3), (39, 3), (40, 4), (300, 12)])
 def test_views_that_are_set_aside_are_spread(photos: int, aside: int) -> None:
     assert views_to_set_aside(photos) == aside
     chosen = set_aside_to_stop(list(range(photos)))
