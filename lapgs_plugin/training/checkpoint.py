@@ -65,7 +65,6 @@ class GainsState(_State):
     looks: list[tuple[PositiveInt, list[Annotated[float, AllowInfNan(False)]]]]
     decided: PositiveInt | None
     expected: Annotated[float, AllowInfNan(False)] | None
-    highest: Annotated[NonNegativeFloat, AllowInfNan(False)]
 
 
 class ModelState(_State):

@@ -16,7 +16,7 @@ PHOTOS_OF_ONE = 10
 """One of so many training views is set aside, within the next two bounds."""
 FEWEST_ASIDE = 3
 """Fewest views that are set aside."""
-MOST_ASIDE = 12
+MOST_ASIDE = 8
 """Most views that are set aside."""
 
 FIRST_SHARE = 0.25
@@ -25,27 +25,23 @@ DECAY_FROM = 0.6
 """Share of a stage's iterations, at least, after which its length is decided. The rest is its decay."""
 LEAST_SHARE = 1 / 8
 """Share of its most iterations before which a stage's length is not decided: at first, views differ in their gains."""
-LOOK_SHARE = 1 / 16
+LOOK_SHARE = 1 / 8
 """Share of the iterations so far between two measurements."""
-MOST_LOOKS = 256
-"""A stage's most iterations, divided by the fewest between two measurements."""
 WINDOW = 0.5
 """Share of the iterations so far, the last ones, whose measurements count."""
-LEAST_LOOKS = 6
+LEAST_LOOKS = 5
 """Fewest measurements from which gains are extrapolated."""
 MORE = 4 / 3
 """Factor on the iterations so far up to which gains are extrapolated."""
 LEAST_GAIN = 0.1
 """Decibels that views should gain by then for a stage to go on."""
-FALLEN = 1 / 3
-"""Share of the highest gain so far that they should gain at least, in its first iterations, when gains still rise."""
 
 
 def views_to_set_aside(photos: int) -> int:
     """Return how many of so many training views are set aside.
 
     >>> [views_to_set_aside(photos) for photos in (10, 43, 112, 255)]
-    [3, 4, 11, 12]
+    [3, 4, 8, 8]
     """
     return min(MOST_ASIDE, max(FEWEST_ASIDE, photos // PHOTOS_OF_ONE))
 
@@ -67,7 +63,6 @@ class StageGains:
         decided: iteration after which the plan was decided; None before.
         expected: gain in dB within the next third of the iterations, as of the last measurement; None if too few are
             there.
-        highest: the highest of these gains so far, at least 0.
     """
 
     most: int
@@ -75,7 +70,6 @@ class StageGains:
     looks: list[tuple[int, list[float]]] = field(default_factory=list)
     decided: int | None = None
     expected: float | None = None
-    highest: float = 0.0
 
     def __post_init__(self) -> None:
         self._reach_next_look()
@@ -88,11 +82,10 @@ class StageGains:
         """Note the PSNR of the views after an iteration, and plan the stage anew."""
         self.looks.append((iteration, list(psnrs)))
         self.expected = self._extrapolated()
-        self.highest = max(self.highest, self.expected or 0.0)
         ends = math.ceil(iteration / DECAY_FROM)
         if ends >= self.most:
             self.planned, self.decided = self.most, iteration
-        elif iteration >= LEAST_SHARE * self.most and self._stopped_gaining():
+        elif iteration >= LEAST_SHARE * self.most and self.expected is not None and self.expected < LEAST_GAIN:
             self.planned, self.decided = ends, iteration
         else:
             self._reach_next_look()
@@ -111,12 +104,7 @@ class StageGains:
             "looks": [(iteration, list(psnrs)) for iteration, psnrs in self.looks],
             "decided": self.decided,
             "expected": self.expected,
-            "highest": self.highest,
         }
-
-    def _stopped_gaining(self) -> bool:
-        """Return whether views are expected to gain little, and less than before: at first, gains rise."""
-        return self.expected is not None and self.expected < min(LEAST_GAIN, FALLEN * self.highest)
 
     def _reach_next_look(self) -> None:
         """Plan enough iterations for another measurement before the decay."""
@@ -126,8 +114,10 @@ class StageGains:
     @property
     def _next_look(self) -> int:
         """The first iteration after which the views are measured again."""
-        last = self.looks[-1][0] if self.looks else 0
-        return last + max(1, math.ceil(self.most / MOST_LOOKS), math.ceil(LOOK_SHARE * last))
+        if not self.looks:
+            return max(1, math.ceil((1.0 - WINDOW) * LEAST_SHARE * self.most))
+        last = self.looks[-1][0]
+        return last + math.ceil(LOOK_SHARE * last)
 
     def _extrapolated(self) -> float | None:
         """Return the median of the views' gains up to `MORE` times the iterations so far; None if few were measured."""
