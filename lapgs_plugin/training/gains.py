@@ -20,7 +20,7 @@ MOST_ASIDE = 8
 """Most views that are set aside."""
 
 FIRST_SHARE = 0.25
-"""Share of its most iterations that the coarsest level is planned with at first."""
+"""Share of its most iterations that a level is planned with at first."""
 DECAY_FROM = 0.6
 """Share of a stage's iterations, at least, after which its length is decided. The rest is its decay."""
 LEAST_SHARE = 1 / 8
@@ -50,8 +50,9 @@ def views_to_set_aside(photos: int) -> int:
 class StageGains:
     """Plan the iterations of a stage by the PSNR of views that are set aside.
 
-    The rates of a stage fall with the share of its planned iterations that is done. The plan grows with the stage, so
-    that this share stays at `DECAY_FROM` as long as views gain enough. Then it stays, and the rates fall to their ends.
+    The rates of a stage fall with the share of its planned iterations that is done. Once that is `DECAY_FROM`, the plan
+    grows with the stage as long as views gain enough, so that the rates stay. Then the plan stays, and the rates fall
+    to their ends. With the rates of a stage's beginning, views would gain little for another reason: noise.
 
     A gain is extrapolated as linear in the logarithm of the iteration, by least squares, for each view by itself. The
     median over the views decides.

@@ -143,14 +143,12 @@ class Trainer:
 
     def _gains(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageGains | None:
         """Return what decides the length of a stage by views that are set aside; None without --stop auto."""
-        prepared = self.prepared
-        if not prepared.settings.stops_early:
+        if not self.prepared.settings.stops_early:
             return None
+        most = self.prepared.planned[stage.level].iterations
         if checkpoint is not None:
-            return StageGains(prepared.planned[stage.level].iterations, **checkpoint["gains"])
-        most = prepared.planned[stage.level].iterations
-        is_first = stage.level == prepared.plan.levels - 1
-        return StageGains(most, max(1, round(FIRST_SHARE * most)) if is_first else min(most, stage.iterations))
+            return StageGains(most, **checkpoint["gains"])
+        return StageGains(most, max(1, round(FIRST_SHARE * most)))
 
     def _say_what_is_chosen(self) -> None:
         """Tell the user the effect of the settings on this scene and device."""
