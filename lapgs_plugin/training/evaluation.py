@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import fmean
 from typing import Any
 
@@ -77,17 +78,19 @@ class StageEvaluation:
 
     def withheld(self) -> list[float]:
         """Return the PSNR in dB of the views that decide the stage's length, at its size and after a colour fit."""
-        run, level = self.run, self.run.stage.level
-        with run.record.overhead.timed("evaluation"):
-            return [self._fitted_psnr(view) for view in level_views(run.prepared.withheld, level)]
+        with self.run.record.overhead.timed("evaluation"):
+            return [self._fitted_psnr(view) for view in self._withheld]
+
+    @cached_property
+    def _withheld(self) -> tuple[LevelView, ...]:
+        return level_views(self.run.prepared.withheld, self.run.stage.level)
 
     @torch.no_grad()
     def _fitted_psnr(self, view: LevelView) -> float:
         """Return the PSNR of a training view at the stage's size, after a colour fit."""
         run, images = self.run, self.run.images
-        image = run.prepared.rasterizer(
-            run.model.field, at_pose(view, run.poses).camera, background=run.background
-        ).image
+        camera = at_pose(view, run.poses).camera
+        image = run.prepared.rasterizer.render_image(run.model.field, camera, background=run.background)
         composed = add_prediction(image, None if images.predictions is None else images.predictions.get(view.name))
         photo, _ = images.photos.get(view.name)
         return color_fitted_psnr(composed, photo, images.photos.get_weights(view.name))

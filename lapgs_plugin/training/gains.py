@@ -19,10 +19,9 @@ FEWEST_ASIDE = 3
 MOST_ASIDE = 8
 """Most views that are set aside."""
 
-FIRST_SHARE = 0.25
-"""Share of its most iterations that a level is planned with at first."""
 DECAY_FROM = 0.6
-"""Share of a stage's iterations, at least, after which its length is decided. The rest is its decay."""
+"""Share of a stage's iterations after which its length was decided, if that is less than its most. The rest is its
+decay. Of its most iterations it is the last share at which a shorter length can be decided."""
 LEAST_SHARE = 1 / 8
 """Share of its most iterations before which a stage's length is not decided: at first, views differ in their gains."""
 LOOK_SHARE = 1 / 8
@@ -50,16 +49,16 @@ def views_to_set_aside(photos: int) -> int:
 class StageGains:
     """Plan the iterations of a stage by the PSNR of views that are set aside.
 
-    The rates of a stage fall with the share of its planned iterations that is done. Once that is `DECAY_FROM`, the plan
-    grows with the stage as long as views gain enough, so that the rates stay. Then the plan stays, and the rates fall
-    to their ends. With the rates of a stage's beginning, views would gain little for another reason: noise.
+    A stage begins as one of its most iterations. When views stop gaining, a length is planned of which `DECAY_FROM` is
+    over: rates, which follow the share of the planned iterations that is done, fall to their ends in the rest. A stage
+    whose views go on gaining has the schedule of its most iterations throughout.
 
     A gain is extrapolated as linear in the logarithm of the iteration, by least squares, for each view by itself. The
     median over the views decides.
 
     Attributes:
         most: iterations of the stage.
-        planned: iterations, so far.
+        planned: iterations, as long as nothing else is decided.
         looks: iteration and PSNR of each view in dB of all measurements.
         decided: iteration after which the plan was decided; None before.
         expected: gain in dB within the next third of the iterations, as of the last measurement; None if too few are
@@ -72,9 +71,6 @@ class StageGains:
     decided: int | None = None
     expected: float | None = None
 
-    def __post_init__(self) -> None:
-        self._reach_next_look()
-
     def is_due(self, iteration: int) -> bool:
         """Return whether the views are to be measured after an iteration."""
         return self.decided is None and iteration >= self._next_look
@@ -85,11 +81,9 @@ class StageGains:
         self.expected = self._extrapolated()
         ends = math.ceil(iteration / DECAY_FROM)
         if ends >= self.most:
-            self.planned, self.decided = self.most, iteration
+            self.decided = iteration
         elif iteration >= LEAST_SHARE * self.most and self.expected is not None and self.expected < LEAST_GAIN:
             self.planned, self.decided = ends, iteration
-        else:
-            self._reach_next_look()
 
     @property
     def length(self) -> DecidedLength | None:
@@ -106,11 +100,6 @@ class StageGains:
             "decided": self.decided,
             "expected": self.expected,
         }
-
-    def _reach_next_look(self) -> None:
-        """Plan enough iterations for another measurement before the decay."""
-        if self.decided is None:
-            self.planned = min(self.most, max(self.planned, math.ceil(self._next_look / DECAY_FROM)))
 
     @property
     def _next_look(self) -> int:

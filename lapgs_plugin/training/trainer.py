@@ -26,7 +26,7 @@ from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.evaluation import StageEvaluation
-from lapgs_plugin.training.gains import FIRST_SHARE, StageGains
+from lapgs_plugin.training.gains import StageGains
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.planning import unpruned_levels
@@ -148,7 +148,7 @@ class Trainer:
         most = self.prepared.planned[stage.level].iterations
         if checkpoint is not None:
             return StageGains(most, **checkpoint["gains"])
-        return StageGains(most, max(1, round(FIRST_SHARE * most)))
+        return StageGains(most, planned=most)
 
     def _say_what_is_chosen(self) -> None:
         """Tell the user the effect of the settings on this scene and device."""

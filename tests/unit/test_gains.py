@@ -33,16 +33,22 @@ def flat_after(iteration: int) -> Curve:
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.integers(1, 3_000), st.integers(1, 8), st.integers(1, 1_000))
-def test_views_that_go_on_gaining_get_all_iterations(most: int, step: int, planned: int) -> None:
-    gains = StageGains(most, min(most, planned))
-    assert trained(gains, flat_after(most), step) == most
+@given(st.integers(1, 3_000), st.integers(1, 8))
+def test_views_that_go_on_gaining_get_all_iterations_in_one_schedule(most: int, step: int) -> None:
+    gains, planned = StageGains(most, most), set()
+
+    def curve(done: int) -> list[float]:
+        planned.add(gains.planned)
+        return flat_after(most)(done)
+
+    assert trained(gains, curve, step) == most
+    assert planned <= {most}
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.integers(3_000, 6_000), st.sampled_from([1, 3, 8]), st.sampled_from([1_000, 4_000, 15_000]))
-def test_a_stage_ends_soon_after_its_views_stopped_gaining(end: int, step: int, planned: int) -> None:
-    gains = StageGains(30_000, planned)
+@given(st.integers(3_000, 6_000), st.sampled_from([1, 3, 8]))
+def test_a_stage_ends_soon_after_its_views_stopped_gaining(end: int, step: int) -> None:
+    gains = StageGains(30_000, 30_000)
     length = trained(gains, flat_after(end), step)
     assert gains.decided is not None
     assert end < gains.decided < 2.3 * end  # half of the iterations so far count; 2.2 was the worst
@@ -52,36 +58,20 @@ def test_a_stage_ends_soon_after_its_views_stopped_gaining(end: int, step: int, 
 
 
 def test_one_view_that_gets_worse_does_not_decide() -> None:
-    gains = StageGains(8_000, 2_000)
+    gains = StageGains(8_000, 8_000)
     assert trained(gains, lambda done: [20.0 - done / 500, *flat_after(8_000)(done)]) == 8_000
 
 
 def test_views_that_get_worse_end_a_stage() -> None:
-    gains = StageGains(30_000, 7_500)
+    gains = StageGains(30_000, 30_000)
     assert trained(gains, lambda done: [20.0 - math.log(done)] * 4) < 7_000  # of these, an eighth at least before
 
 
-@settings(deadline=None, max_examples=10)
-@given(st.floats(2.0, 9.0), st.floats(0.0, 0.3))
-def test_the_share_that_is_done_stays_until_the_length_is_decided(gain: float, noise: float) -> None:
-    """So the rates stay, too, and then fall to their ends."""
-    gains = StageGains(20_000, 1_000)
-    shares = []
-
-    def curve(done: int) -> list[float]:
-        shares.append(done / gains.planned)
-        return [gain * math.log(done) + noise * math.sin(done)] * 3
-
-    trained(gains, curve)
-    assert max(shares[:-1]) <= DECAY_FROM + 1e-9
-    assert min(shares) > 0.85 * DECAY_FROM  # an eighth more iterations are planned at each measurement
-
-
 def test_what_was_measured_and_decided_continues() -> None:
-    whole = StageGains(9_000, 3_000)
+    whole = StageGains(9_000, 9_000)
     length = trained(whole, flat_after(1_500))
     for stop in (10, 1_200, 2_000, length - 1):
-        part = StageGains(9_000, 3_000)
+        part = StageGains(9_000, 9_000)
         done = 0
         while done < stop:
             done += 1
