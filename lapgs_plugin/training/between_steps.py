@@ -90,7 +90,7 @@ class BetweenSteps:
         run.settle()
         run.note_gains(self.evaluation.withheld())
         if (decided := gains.length) is not None:
-            back = "" if run.stage.level else ", and are trained on from here"
+            back = "" if run.withholds else ", and are trained on from here"
             self.evaluation.monitor.say(length_line(run.stage.level, gains.planned, decided) + back)
 
     def _decided(self, run: StageRun) -> tuple[bool, bool]:

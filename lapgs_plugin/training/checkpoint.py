@@ -209,7 +209,7 @@ def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
 
 def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
     """Check the parts of a state against each other and the run; raises ValueError."""
-    decided = _decided_length(state, settings)
+    decided = _decided_length(state, stage, settings)
     if decided is not None:
         stage = replace(stage, iterations=decided)
     iteration, joint_from = state["counts"]["iteration"], settings.joint_from(stage)
@@ -240,14 +240,14 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         raise ValueError(f"random is no state of PyTorch's generator ({first_line(error)})") from error
 
 
-def _decided_length(state: dict[str, Any], settings: TrainSettings) -> int | None:
+def _decided_length(state: dict[str, Any], stage: Stage, settings: TrainSettings) -> int | None:
     """Return the stage's length so far, if it is decided while it trains; raises ValueError."""
     budget, gains = state["budget"], state["gains"]
     if budget is not None and settings.time is None:
         raise ValueError(f"budget is {budget}, expected none without --time")
     if gains is not None and settings.stop == PLANNED:
         raise ValueError("gains has measurements, expected none without --stop auto")
-    if gains is None and settings.stops_early:
+    if gains is None and settings.stops_early and not stage.signed:
         raise ValueError("gains is None, expected measurements with --stop auto")
     last = budget or gains
     return None if last is None else int(last["planned"])

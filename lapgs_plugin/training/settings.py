@@ -181,8 +181,8 @@ class TrainSettings(HierarchySettings):
     stop: str = option(
         PLANNED,
         "When a level ends. planned: after its --split of --iterations. auto: when training views that are set aside, "
-        "one of 10, stop gaining PSNR, and after its --split at the latest. Once the end of the finest level is "
-        "decided, it trains on them, too.",
+        "one of 10, stop gaining PSNR, and after its --split at the latest; residuals get iterations in proportion to "
+        "the base's. Once the last end is decided, the views are trained on, too.",
         choices=(PLANNED, AUTO),
     )
     accumulate_views: int = option(

@@ -204,12 +204,16 @@ class StageRun:
         if self.gains.decided is not None:
             self._train_on(self._trained_views())
 
+    @property
+    def withholds(self) -> bool:
+        """Whether views are not trained on now, because the length of this or a finer stage depends on them."""
+        is_last = self.stage.level == 0 or not self._settings.nested
+        return self.gains is not None and (self.gains.decided is None or not is_last)
+
     def _trained_views(self) -> tuple[LevelView, ...]:
-        """Return the views that the stage trains on: all, but for those set aside while a decision depends on them."""
-        prepared, level = self.prepared, self.stage.level
-        is_open = self.gains is not None and (level > 0 or self.gains.decided is None)
-        withheld = {view.name for view in prepared.withheld} if is_open else set()
-        return level_views([view for view in prepared.scene.train if view.name not in withheld], level)
+        prepared = self.prepared
+        withheld = {view.name for view in prepared.withheld} if self.withholds else set()
+        return level_views([view for view in prepared.scene.train if view.name not in withheld], self.stage.level)
 
     def _train_on(self, views: tuple[LevelView, ...]) -> None:
         """Train on these views from the next step on."""

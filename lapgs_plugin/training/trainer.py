@@ -142,8 +142,12 @@ class Trainer:
         return StageBudget(self.clock, ends, run_ends, stage.iterations, len(self.prepared.scene.test))
 
     def _gains(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageGains | None:
-        """Return what decides the length of a stage by views that are set aside; None without --stop auto."""
-        if not self.prepared.settings.stops_early:
+        """Return what decides the length of a stage by views that are set aside; None without --stop auto.
+
+        None for residuals, too: most of their gain comes when the coarser levels are trained along, in the last part of
+        their stage, so that their first gains promise too little. Their length is in proportion to the base's.
+        """
+        if not self.prepared.settings.stops_early or stage.signed:
             return None
         most = self.prepared.planned[stage.level].iterations
         if checkpoint is not None:
