@@ -54,7 +54,7 @@ class StageGains:
     whose views go on gaining has the schedule of its most iterations throughout.
 
     A gain is extrapolated as linear in the logarithm of the iteration, by least squares, for each view by itself. The
-    median over the views decides.
+    median over the views decides, if it is little twice in a row: one measurement differs from the next.
 
     Attributes:
         most: iterations of the stage.
@@ -78,11 +78,11 @@ class StageGains:
     def note(self, iteration: int, psnrs: Sequence[float]) -> None:
         """Note the PSNR of the views after an iteration, and plan the stage anew."""
         self.looks.append((iteration, list(psnrs)))
-        self.expected = self._extrapolated()
+        before, self.expected = self.expected, self._extrapolated()
         ends = math.ceil(iteration / DECAY_FROM)
         if ends >= self.most:
             self.decided = iteration
-        elif iteration >= LEAST_SHARE * self.most and self.expected is not None and self.expected < LEAST_GAIN:
+        elif iteration >= LEAST_SHARE * self.most and _is_little(before) and _is_little(self.expected):
             self.planned, self.decided = ends, iteration
 
     @property
@@ -121,3 +121,7 @@ class StageGains:
             sum((time - centre) * psnrs[view] for time, psnrs in looks) / spread for view in range(len(looks[0][1]))
         ]
         return math.log(MORE) * median(slopes)
+
+
+def _is_little(gain: float | None) -> bool:
+    return gain is not None and gain < LEAST_GAIN
