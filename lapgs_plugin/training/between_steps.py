@@ -90,8 +90,8 @@ class BetweenSteps:
         run.settle()
         run.note_gains(self.evaluation.withheld())
         if (decided := gains.length) is not None:
-            back = "" if run.withholds else ", and are trained on from here"
-            self.evaluation.monitor.say(length_line(run.stage.level, gains.planned, decided) + back)
+            line = length_line(run.stage.level, gains.planned, decided)
+            self.evaluation.monitor.say(f"{line}, and are trained on from here")
 
     def _decided(self, run: StageRun) -> tuple[bool, bool]:
         """Return whether to stop, and whether to save a checkpoint, as all ranks decide at the same step."""

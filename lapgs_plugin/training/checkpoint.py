@@ -247,7 +247,7 @@ def _decided_length(state: dict[str, Any], stage: Stage, settings: TrainSettings
         raise ValueError(f"budget is {budget}, expected none without --time")
     if gains is not None and settings.stop == PLANNED:
         raise ValueError("gains has measurements, expected none without --stop auto")
-    if gains is None and settings.stops_early and not stage.signed:
+    if gains is None and settings.stops_early and stage.level == settings.levels - 1:
         raise ValueError("gains is None, expected measurements with --stop auto")
     last = budget or gains
     return None if last is None else int(last["planned"])

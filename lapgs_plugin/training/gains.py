@@ -32,7 +32,7 @@ LEAST_LOOKS = 5
 """Fewest measurements from which gains are extrapolated."""
 MORE = 4 / 3
 """Factor on the iterations so far up to which gains are extrapolated."""
-LEAST_GAIN = 0.1
+LEAST_GAIN = 0.05
 """Decibels that views should gain by then for a stage to go on."""
 
 

@@ -158,7 +158,7 @@ class PreparedRun(StagedRun):
 
     @cached_property
     def withheld(self) -> tuple[View, ...]:
-        """Training views that are not trained on before the last length is decided, for --stop auto."""
+        """Training views that are not trained on before the lengths of levels are decided, for --stop auto."""
         return tuple(set_aside_to_stop(self.scene.train)) if self.settings.stops_early else ()
 
     def steps_of(self, stage: Stage, views: int) -> WholeSteps:

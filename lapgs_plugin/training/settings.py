@@ -180,9 +180,9 @@ class TrainSettings(HierarchySettings):
     )
     stop: str = option(
         PLANNED,
-        "When a level ends. planned: after its --split of --iterations. auto: when training views that are set aside, "
-        "one of 10, stop gaining PSNR, and after its --split at the latest; residuals get iterations in proportion to "
-        "the base's. Once the last end is decided, the views are trained on, too.",
+        "When levels end. planned: each after its --split of --iterations. auto: the coarsest when training views that "
+        "are set aside, one of 10, stop gaining PSNR, and after its --split at the latest; finer ones in proportion. "
+        "Once that is decided, the views are trained on, too.",
         choices=(PLANNED, AUTO),
     )
     accumulate_views: int = option(

@@ -89,7 +89,7 @@ class StageRun:
         geometry: supervises depth, normals and sky; None without.
         record: measures it.
         budget: decides the stage's length by the clock; None where it is planned.
-        gains: decides it by views that are set aside; None without --stop auto.
+        gains: decides it by views that are set aside; None where they do not.
         say: shows a line to the user.
         joint: the finished fields while they are trained jointly; None before.
         loss: smoothed loss, NaN before the first iteration and after a finished stage.
@@ -206,9 +206,8 @@ class StageRun:
 
     @property
     def withholds(self) -> bool:
-        """Whether views are not trained on now, because the length of this or a finer stage depends on them."""
-        is_last = self.stage.level == 0 or not self._settings.nested
-        return self.gains is not None and (self.gains.decided is None or not is_last)
+        """Whether views are not trained on now, because the stage's length depends on them."""
+        return self.gains is not None and self.gains.decided is None
 
     def _trained_views(self) -> tuple[LevelView, ...]:
         prepared = self.prepared

@@ -144,10 +144,10 @@ class Trainer:
     def _gains(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageGains | None:
         """Return what decides the length of a stage by views that are set aside; None without --stop auto.
 
-        None for residuals, too: most of their gain comes when the coarser levels are trained along, in the last part of
-        their stage, so that their first gains promise too little. Their length is in proportion to the base's.
+        None for finer levels, too, whose lengths are in proportion to the coarsest one's. Their first gains promise too
+        little: most comes when rates have fallen again, and of residuals when coarser levels are trained along.
         """
-        if not self.prepared.settings.stops_early or stage.signed:
+        if not self.prepared.settings.stops_early or stage.level < self.prepared.plan.levels - 1:
             return None
         most = self.prepared.planned[stage.level].iterations
         if checkpoint is not None:
@@ -164,7 +164,7 @@ class Trainer:
         if withheld := self.prepared.withheld:
             say(
                 f"--stop auto: {len(withheld)} of {len(scene.train)} training views are set aside and decide when "
-                f"levels end, together after {self.prepared.planned.iterations:,} iterations at most"
+                f"levels end, after {self.prepared.planned.iterations:,} iterations together at most"
             )
         elif (few := few_views_line(len(scene.train), self.prepared.plan.iterations, bool(scene.test))) is not None:
             say(few)
