@@ -172,7 +172,7 @@ def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str 
     if run.resumes:
         return extended_config(path, run.settings) if run.settings.extended else None
     photos = run.archive.manifest.scene
-    length = run.settings.iterations if run.settings.time is None else None
+    length = run.planned.iterations if run.settings.time is None else None
     write_config(
         path,
         context,

@@ -40,7 +40,14 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import METRICS, REPORT
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
-from lapgs_plugin.runs.training_figures import VIEW_PSNR, finest_gains, last_view_psnrs, smaller_gains, weak_levels
+from lapgs_plugin.runs.training_figures import (
+    VIEW_PSNR,
+    finest_gains,
+    last_view_psnrs,
+    length_lines,
+    smaller_gains,
+    weak_levels,
+)
 from lapgs_plugin.untrusted import shortened
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
@@ -102,6 +109,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         rows=comparison_rows([measured.metrics for measured in runs]),
         charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,
+        decided=length_lines(run.archive.manifest.records),
         weak=_weak_levels(run),
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),

@@ -102,6 +102,25 @@ class SceneReference:
 
 
 @dataclass(frozen=True)
+class DecidedLength:
+    """Tell why a level has as many iterations as it has, where views that were set aside decided that.
+
+    Attributes:
+        most: iterations that it might have had.
+        after: iteration after which its length was decided.
+        views: number of views.
+        gain: dB that they were to gain in a third more iterations; None if too few measurements told.
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+
+    most: PositiveInt
+    after: PositiveInt
+    views: PositiveInt
+    gain: Annotated[float, Field(allow_inf_nan=False)] | None
+
+
+@dataclass(frozen=True)
 class LevelRecord:
     """Describe a finished level.
 
@@ -120,6 +139,7 @@ class LevelRecord:
         breakdown_seconds: optimization by part of an iteration (`profiling.PARTS`); empty when not measured.
         gpu_busy_seconds: estimate of the seconds that the GPU executed kernels; None when not measured.
         start_gaussians: Gaussians before its first iteration; None when that was not recorded.
+        decided: why it was trained for that long; None where that was planned.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -137,6 +157,7 @@ class LevelRecord:
     breakdown_seconds: dict[str, NonNegativeFloat] = field(default_factory=dict)
     gpu_busy_seconds: NonNegativeFloat | None = None
     start_gaussians: NonNegativeInt | None = None
+    decided: DecidedLength | None = None
 
     @classmethod
     def of(cls, stage: Stage, field: GaussianField, train_seconds: float = 0.0) -> LevelRecord:

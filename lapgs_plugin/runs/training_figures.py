@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from lapgs_plugin.runs.manifest import LevelRecord
+from lapgs_plugin.runs.manifest import DecidedLength, LevelRecord
 
 FEW_LEFT = 0.1
 """Share of the Gaussians that a level started with, below which its end is reported."""
@@ -52,6 +52,21 @@ def weak_levels(
                 f"little to the coarser level's, enlarged; compare LPIPS with {_instead(finest.signed, advised)}"
             )
     return lines
+
+
+def length_line(level: int, iterations: int, decided: DecidedLength) -> str:
+    """Say how many iterations a level has, and why."""
+    gain = "an unknown gain" if decided.gain is None else f"{decided.gain:+.2f} dB"
+    limit = "the most it may have" if iterations == decided.most else f"of at most {decided.most:,}"
+    return (
+        f"level {level}: {iterations:,} iterations, {limit}; after {decided.after:,}, {decided.views} views set aside "
+        f"promised {gain} for a third more"
+    )
+
+
+def length_lines(records: Sequence[LevelRecord]) -> list[str]:
+    """Return `length_line` of the levels whose lengths were decided."""
+    return [length_line(record.level, record.iterations, record.decided) for record in records if record.decided]
 
 
 def finest_gains(psnrs: Mapping[int, Sequence[float]]) -> list[float]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from lapgs_plugin.errors import TrainingStoppedError
 from lapgs_plugin.interrupt import StopRequest
+from lapgs_plugin.runs.training_figures import length_line
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.training.evaluation import StageEvaluation
 from lapgs_plugin.training.monitor import Tick
@@ -50,6 +51,7 @@ class BetweenSteps:
         Raises:
             TrainingStoppedError: the user asked to stop; a checkpoint was written.
         """
+        self._measure_gains(run)
         evaluation, test_every = self.evaluation, run.prepared.control.test_every
         iteration = run.counts.iteration
         due_test = iteration == run.stage.iterations if test_every is None else run.passed(test_every)
@@ -79,6 +81,17 @@ class BetweenSteps:
                 f"stopped at level {run.stage.level}, iteration {iteration} of {run.stage.iterations}; "
                 f"a checkpoint is in {run.prepared.archive.path()}, the same command with --resume continues"
             )
+
+    def _measure_gains(self, run: StageRun) -> None:
+        """Measure the views that decide the stage's length, if it is time; tell the user once it is decided."""
+        gains = run.gains
+        if gains is None or not gains.is_due(run.counts.iteration):
+            return
+        run.settle()
+        run.note_gains(self.evaluation.withheld())
+        if (decided := gains.length) is not None:
+            line = length_line(run.stage.level, gains.planned, decided)
+            self.evaluation.monitor.say(f"{line}, and are trained on from here")
 
     def _decided(self, run: StageRun) -> tuple[bool, bool]:
         """Return whether to stop, and whether to save a checkpoint, as all ranks decide at the same step."""

@@ -24,7 +24,7 @@ from typing_extensions import NotRequired, TypedDict
 from lapgs_plugin.errors import FieldError, RunFolderError, first_line
 from lapgs_plugin.fields.gaussian_field import SPLAT_NAMES, GaussianField, field_from_splats
 from lapgs_plugin.hierarchy.plan import Stage
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import PLANNED, TrainSettings
 from lapgs_plugin.untrusted import problem
 
 ADVICE = "delete it to continue from the last finished level"
@@ -56,6 +56,15 @@ class BudgetState(_State):
     planned: PositiveInt
     stage_seconds: Annotated[float, AllowInfNan(False)]
     run_seconds: Annotated[float, AllowInfNan(False)]
+
+
+class GainsState(_State):
+    """Result of `gains.StageGains.state`."""
+
+    planned: PositiveInt
+    looks: list[tuple[PositiveInt, list[Annotated[float, AllowInfNan(False)]]]]
+    decided: PositiveInt | None
+    expected: Annotated[float, AllowInfNan(False)] | None
 
 
 class ModelState(_State):
@@ -94,6 +103,7 @@ class StageState(_State):
     most_views: PositiveInt | None
     breakdown: dict[str, Seconds]
     budget: BudgetState | None
+    gains: GainsState | None
     model: ModelState
     densifier: dict[str, Any]
     joint: NotRequired[dict[int, ModelState] | None]
@@ -199,10 +209,9 @@ def check_moments(moments: Any, field: GaussianField, path: Path) -> None:
 
 def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, finished: Collection[int]) -> None:
     """Check the parts of a state against each other and the run; raises ValueError."""
-    if (budget := state["budget"]) is not None:
-        if settings.time is None:
-            raise ValueError(f"budget is {budget}, expected none without --time")
-        stage = replace(stage, iterations=budget["planned"])
+    decided = _decided_length(state, stage, settings)
+    if decided is not None:
+        stage = replace(stage, iterations=decided)
     iteration, joint_from = state["counts"]["iteration"], settings.joint_from(stage)
     if state["level"] != stage.level:
         raise ValueError(f"level is {state['level']}, expected {stage.level}")
@@ -211,7 +220,7 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
     _check_model(state["model"], "model", stage.signed, settings.sh_degree_of(stage.level))
     joint = state.get("joint") or {}
     began = iteration >= joint_from if joint_from is not None else False
-    if budget is not None and joint_from is not None:
+    if decided is not None and joint_from is not None:
         began = bool(joint)  # the stage may have become longer or shorter since
     wanted = set(finished) - {stage.level} if began else set()
     if joint.keys() != wanted:
@@ -229,6 +238,19 @@ def _check_state(state: dict[str, Any], stage: Stage, settings: TrainSettings, f
         torch.Generator().set_state(random)
     except RuntimeError as error:
         raise ValueError(f"random is no state of PyTorch's generator ({first_line(error)})") from error
+
+
+def _decided_length(state: dict[str, Any], stage: Stage, settings: TrainSettings) -> int | None:
+    """Return the stage's length so far, if it is decided while it trains; raises ValueError."""
+    budget, gains = state["budget"], state["gains"]
+    if budget is not None and settings.time is None:
+        raise ValueError(f"budget is {budget}, expected none without --time")
+    if gains is not None and settings.stop == PLANNED:
+        raise ValueError("gains has measurements, expected none without --stop auto")
+    if gains is None and settings.stops_early and stage.level == settings.levels - 1:
+        raise ValueError("gains is None, expected measurements with --stop auto")
+    last = budget or gains
+    return None if last is None else int(last["planned"])
 
 
 def _check_joint(models: Mapping[int, dict[str, Any]], name: str, settings: TrainSettings) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import fmean
 from typing import Any
 
@@ -17,8 +18,10 @@ from lapgs_plugin.ops.composition import add_prediction
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.training.monitor import Monitor
+from lapgs_plugin.training.poses import at_pose
 from lapgs_plugin.training.quality import LEAST_GAIN, SAMPLED_VIEWS, QualityWatch, copied, spread_views
 from lapgs_plugin.training.stage import StageRun
+from lapgs_plugin.training.views import LevelView, level_views
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,25 @@ class StageEvaluation:
             measured["sampled_psnr"] = fmean(each.plain for each in sampled)
             measured["sampled_fitted_psnr"] = fmean(each.fitted for each in sampled)
         return measured
+
+    def withheld(self) -> list[float]:
+        """Return the PSNR in dB of the views that decide the stage's length, at its size and after a colour fit."""
+        with self.run.record.overhead.timed("evaluation"):
+            return [self._fitted_psnr(view) for view in self._withheld]
+
+    @cached_property
+    def _withheld(self) -> tuple[LevelView, ...]:
+        return level_views(self.run.prepared.withheld, self.run.stage.level)
+
+    @torch.no_grad()
+    def _fitted_psnr(self, view: LevelView) -> float:
+        """Return the PSNR of a training view at the stage's size, after a colour fit."""
+        run, images = self.run, self.run.images
+        camera = at_pose(view, run.poses).camera
+        image = run.prepared.rasterizer.render_image(run.model.field, camera, background=run.background)
+        composed = add_prediction(image, None if images.predictions is None else images.predictions.get(view.name))
+        photo, _ = images.photos.get(view.name)
+        return color_fitted_psnr(composed, photo, images.photos.get_weights(view.name))
 
     def note_views(self) -> None:
         """Write the PSNR of each held-out view, in the state that is archived, to the history if it can be of use."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage, StagePlan, continues_field
+from lapgs_plugin.training.gains import LEAST_PHOTOS
 from lapgs_plugin.training.quality import LEAST_VIEWS
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import BEST, TrainSettings
@@ -18,8 +19,8 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         views: number of training views; None if unknown.
 
     Raises:
-        UserInputError: levels, split and image size do not go together, or there are too few views for a step or for
-            --keep best.
+        UserInputError: levels, split and image size do not go together, or there are too few views for a step, for
+            --keep best or for --stop auto.
     """
     if views is not None and (asked := settings.asked_views or 1) > views:
         raise UserInputError(
@@ -29,6 +30,11 @@ def make_plan(size: tuple[int, int], settings: TrainSettings, views: int | None 
         raise UserInputError(
             f"--keep best: sets training views aside, and the scene has {views} of them, expected at least "
             f"{LEAST_VIEWS}; leave it out"
+        )
+    if views is not None and settings.stops_early and views < LEAST_PHOTOS:
+        raise UserInputError(
+            f"--stop auto: sets training views aside, and the scene has {views} of them, expected at least "
+            f"{LEAST_PHOTOS}; leave it out"
         )
     return StagePlan.create(size, settings.scheduled, settings.levels, settings.shares, settings.kind)
 

@@ -18,6 +18,7 @@ import torch
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError, UserInputError, counted, errors_about
 from lapgs_plugin.files import MANIFEST, one_line_errors
+from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option_values
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.rendering.run import load_reference, require_same_scene
@@ -91,10 +92,11 @@ class TrainRequest:
         if (text := self.settings.time) is not None:
             if {"time", "iterations"} <= self.chosen:
                 raise UserInputError(f"--time {text} with --iterations: both say how long to train; give one of them")
-            if self.control.gpu_busy:
-                raise UserInputError(
-                    f"--gpu-busy with --time {text}: is measured in stages of a known length; leave it out"
-                )
+            if {"time", "stop"} <= self.chosen and self.settings.stop == AUTO:
+                raise UserInputError(f"--time {text} with --stop auto: both say when to end; give one of them")
+        open_end = "--stop auto" if self.settings.stops_early else None if text is None else f"--time {text}"
+        if open_end is not None and self.control.gpu_busy:
+            raise UserInputError(f"--gpu-busy with {open_end}: is measured in stages of a known length; leave it out")
 
 
 def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextManager[PreparedRun]:
@@ -111,6 +113,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
         LapgsError: the request, the scene, the run folder or the machine does not allow the run.
     """
     photos, settings, ranks = request.photos, request.settings, request.ranks
+    _require_one_process(ranks, settings)
     say = say if ranks.leads else _silent
     require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
     depth = resolve_depth(Path(request.scene), settings.depth)
@@ -155,9 +158,10 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
         _require_views(ranks, photos)
         if "iterations" not in request.chosen and (fewer := settings.for_photos(photos)) != settings:
             settings = fewer
+            most = "at most " if settings.stops_early else ""
             say(
-                f"{photos} training photos: {settings.iterations:,} iterations, {settings.iterations // photos} passes "
-                "over them; more gain little, and --iterations asks for another number"
+                f"{photos} training photos: {most}{settings.iterations:,} iterations, {settings.iterations // photos} "
+                "passes over them; more gain little, and --iterations asks for another number"
             )
         if settings.time is not None:  # how long it may be is measured once the photos are read
             make_plan(size, settings, photos)
@@ -267,10 +271,13 @@ def _continued_settings(
     """
     out, manifest, chosen = Path(request.out), archive.manifest, request.chosen
     settings = settings_from_manifest(manifest, str(archive.path(MANIFEST)))
+    _require_one_process(request.ranks, settings)
     if manifest.complete:
         asked = request.settings.iterations if "iterations" in chosen else None
         _require_untimed(out, settings, request.settings, asked)
-        if settings.time is None:
+        if settings.stops_early:
+            say(f"{out} is finished: its views set aside have ended it")
+        elif settings.time is None:
             settings = extended_settings(archive, settings, asked, say)
         else:
             say(f"{out} is finished: its --time {settings.time} is over")
@@ -322,6 +329,12 @@ def _require_views(ranks: Ranks, photos: int) -> None:
         raise UserInputError(f"{ranks.together}: the scene has {photos} training photos; give at most so many ranks")
 
 
+def _require_one_process(ranks: Ranks, settings: TrainSettings) -> None:
+    """Refuse ranks with --stop auto: views that are given back would belong to other ranks than before."""
+    if settings.stops_early and ranks.size > 1:
+        raise UserInputError(f"{ranks.together} with --stop auto: ends runs of one process alone; leave one out")
+
+
 def _require_same_run(ranks: Ranks, scene: Scene, settings: TrainSettings) -> None:
     """Refuse ranks whose scene or settings are not those of rank 0."""
     names = [(view.name, view.camera.size) for view in (*scene.train, *scene.test)]
@@ -336,9 +349,10 @@ def _require_untimed(out: Path, settings: TrainSettings, wanted: TrainSettings, 
             f"--time {wanted.time}: the run in {out} is finished; extend it by --iterations, or start again with "
             "--overwrite"
         )
-    if asked is not None and settings.time is not None:
+    ended = "with --stop auto" if settings.stops_early else f"for --time {settings.time}"
+    if asked is not None and (settings.time is not None or settings.stops_early):
         raise UserInputError(
-            f"--iterations {asked}: the run in {out} was trained for --time {settings.time}, and its schedule is over; "
+            f"--iterations {asked}: the run in {out} was trained {ended}, and its schedule is over; "
             "start again with --overwrite"
         )
 

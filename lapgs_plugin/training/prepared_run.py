@@ -17,7 +17,7 @@ from torch import Tensor
 from lapgs_plugin.fields.gaussian_field import GaussianField, field_from_splats
 from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.fields.units import in_unit
-from lapgs_plugin.hierarchy.plan import Stage, level_size
+from lapgs_plugin.hierarchy.plan import Stage, StagePlan, level_size
 from lapgs_plugin.ops.mixed_sizes import similar_sizes
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.runs.archive import RunArchive
@@ -29,7 +29,7 @@ from lapgs_plugin.stages.run import StagedRun
 from lapgs_plugin.training.densification import DensityControl, control_of
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import iterations_continued, make_plan
-from lapgs_plugin.training.quality import set_aside
+from lapgs_plugin.training.quality import set_aside, set_aside_to_stop
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.ranks.steps import WholeSteps, steps_of
 from lapgs_plugin.training.schedule import MOST_PADDING, StageSchedule, views_per_step
@@ -45,6 +45,7 @@ class PreparedRun(StagedRun):
         settings: of the run; the archive's manifest has the same.
         scene: its training views are those that are trained on.
         aside: training views that were set aside to choose the best state; empty without --keep best.
+        planned: the stages as the settings ask for them; `plan` has the lengths that were decided since.
         rasterizer: renders every field on the device, in world units.
         control: how the run is executed and observed.
         resumes: whether the run continues from its checkpoint, or after its last finished level.
@@ -59,6 +60,7 @@ class PreparedRun(StagedRun):
     settings: TrainSettings
     scene: Scene
     aside: tuple[View, ...]
+    planned: StagePlan
     rasterizer: Rasterizer
     control: TrainingControl
     resumes: bool
@@ -102,11 +104,13 @@ class PreparedRun(StagedRun):
         views = scene.train
         aside = set_aside(views) if settings.keep == BEST else []
         names = {view.name for view in aside}
+        plan = make_plan(scene.smallest_size, settings, len(views))
         run = cls(
             scene=replace(scene, train=tuple(view for view in views if view.name not in names)),
             aside=tuple(aside),
             settings=settings,
-            plan=make_plan(scene.smallest_size, settings, len(views)),
+            plan=plan,
+            planned=plan,
             archive=archive,
             rasterizer=in_unit(placed.rasterizer, archive.manifest.scene.unit),
             device=placed.device,
@@ -118,8 +122,8 @@ class PreparedRun(StagedRun):
             normals=normals or {},
             ranks=ranks,
         )
-        # With --time their lengths were decided by the clock.
-        for record in archive.manifest.records if settings.time is not None else ():
+        # Their lengths were decided while they were trained.
+        for record in archive.manifest.records if settings.time is not None or settings.stops_early else ():
             run = run.lasting(record.level, record.iterations)
         return run
 
@@ -152,9 +156,14 @@ class PreparedRun(StagedRun):
             with suppress(OSError):  # other ranks may have images there
                 folder.rmdir()
 
-    def steps_of(self, stage: Stage) -> WholeSteps:
-        """Return which views the steps of a stage have, and which of them this process renders."""
-        views, settings = len(self.scene.train), self.settings
+    @cached_property
+    def withheld(self) -> tuple[View, ...]:
+        """Training views that are not trained on before the lengths of levels are decided, for --stop auto."""
+        return tuple(set_aside_to_stop(self.scene.train)) if self.settings.stops_early else ()
+
+    def steps_of(self, stage: Stage, views: int) -> WholeSteps:
+        """Return which of so many views the steps of a stage have, and which of them this process renders."""
+        settings = self.settings
         return steps_of(views, settings.seed, stage.level, settings.ranks, self.ranks, self.device)
 
     @cached_property
@@ -162,7 +171,7 @@ class PreparedRun(StagedRun):
         """Names of the views whose images this rank has."""
         trained = [
             self.scene.train[index]
-            for part in self.steps_of(self.plan[0]).own(range(len(self.scene.train)))
+            for part in self.steps_of(self.plan[0], len(self.scene.train)).own(range(len(self.scene.train)))
             for index in part
         ]
         measured = (*self.scene.test, *self.aside)[self.ranks.rank :: self.ranks.size]
@@ -178,8 +187,15 @@ class PreparedRun(StagedRun):
         return similar_sizes(sizes, MOST_PADDING if self.rasterizer.mixes_sizes else 0.0)
 
     def lasting(self, level: int, iterations: int) -> PreparedRun:
-        """Return the run whose stage of a level has so many iterations."""
-        plan = self.plan.lasting(level, iterations)
+        """Return the run whose stage of a level has so many iterations, and finer ones in proportion.
+
+        The result depends on the lengths of coarser levels and on this one alone, not on what was planned in between.
+        """
+        plan = self.planned
+        for stage in self.plan:
+            if stage.level > level:
+                plan = plan.lasting(stage.level, stage.iterations)
+        plan = plan.lasting(level, iterations)
         return replace(self, plan=plan, settings=self.settings.lasting(plan.iterations))
 
     def strategy_of(self, stage: Stage) -> Strategy:

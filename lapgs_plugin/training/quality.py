@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
+from lapgs_plugin.training.gains import views_to_set_aside
 from lapgs_plugin.training.settings import enough_iterations
 
 SAMPLES_OF_A_STAGE = 5
@@ -42,6 +43,11 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
 def set_aside(views: Sequence[View]) -> list[View]:
     """Return the training views that choose the best state: one of 16, but two at least and eight at most."""
     return spread_views(views, min(SAMPLED_VIEWS, max(2, len(views) // 16)))
+
+
+def set_aside_to_stop(views: Sequence[View]) -> list[View]:
+    """Return the training views that decide when a stage ends."""
+    return spread_views(views, views_to_set_aside(len(views)))
 
 
 def copied(state: Any) -> Any:

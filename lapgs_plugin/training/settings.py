@@ -41,6 +41,9 @@ LAST = "last"
 BEST = "best"
 """Choice of --keep: the state whose held-out views were best."""
 
+PLANNED = "planned"
+"""Choice of --stop: after the iterations that a stage was planned with."""
+
 SCHEDULE = "Schedule"
 GSPLAT = "gsplat"
 
@@ -52,15 +55,17 @@ PASSES = 130
 """Passes over the training photos in a run whose iterations are left open, unless they are more than 3DGS's 30,000.
 
 More passes sharpen renders a little, and cost PSNR where photos are few or their exposure changes."""
+MOST_PASSES = 300
+"""The same with --stop auto, which may end the run earlier."""
 
 
-def enough_iterations(photos: int) -> int:
+def enough_iterations(photos: int, passes: int = PASSES) -> int:
     """Return the iterations after which more gain little on so many training photos, and no fewer than a long run has.
 
     >>> enough_iterations(43), enough_iterations(10)
     (5590, 5000)
     """
-    return max(LONG_RUN, PASSES * photos)
+    return max(LONG_RUN, passes * photos)
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,13 @@ class TrainSettings(HierarchySettings):
         "Train for so long instead of --iterations, such as 20s, 2m or 1h: everything from the command's start to the "
         "last level's end. Each level gets its --split of the seconds.",
         metavar="DURATION",
+    )
+    stop: str = option(
+        PLANNED,
+        "When levels end. planned: each after its --split of --iterations. auto: the coarsest when training views that "
+        "are set aside, one of 10, stop gaining PSNR, and after its --split at the latest; finer ones in proportion. "
+        "Once that is decided, the views are trained on, too.",
+        choices=(PLANNED, AUTO),
     )
     accumulate_views: int = option(
         8,
@@ -285,12 +297,26 @@ class TrainSettings(HierarchySettings):
                     f"--densify-until {self.densification.until} with --time: names an iteration of a run whose length "
                     "is not known; leave one out"
                 )
+        if self.stops_early:
+            self._check_open_end()
         if not 0.0 < self.decay <= 1.0:
             raise UserInputError(f"--decay {self.decay}: expected a share of each stage above 0 and at most 1")
         if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
             raise UserInputError(f"--dropout {self.dropout}: expected a share from 0 to below 1, such as 0.2")
         if not 0.0 <= self.ssim_weight <= 1.0:
             raise UserInputError(f"ssim_weight is {self.ssim_weight}, expected 0 (only L1) to 1 (only SSIM)")
+
+    def _check_open_end(self) -> None:
+        """Refuse settings that contradict levels whose length views that are set aside decide."""
+        if (until := self.densification.until) is not None:
+            raise UserInputError(
+                f"--densify-until {until} with --stop auto: names an iteration of a run whose length is not known; "
+                "leave one out"
+            )
+        if self.keep == BEST:
+            raise UserInputError("--keep best with --stop auto: both set training views aside; leave one out")
+        if self.extended:
+            raise UserInputError(f"extended {self.extended}: expected 0 with --stop auto")
 
     def _choose_strategy(self) -> None:
         """Replace the strategy auto by the one that it means here.
@@ -353,9 +379,11 @@ class TrainSettings(HierarchySettings):
     def for_photos(self, count: int) -> TrainSettings:
         """Return settings with `PASSES` over the photos, but no shorter than a long run and no longer than these.
 
+        With --stop auto they are `MOST_PASSES`.
+
         Settings of the paper, and of a schedule in iterations of the run, stay.
         """
-        enough, control = enough_iterations(count), self.densification
+        enough, control = enough_iterations(count, MOST_PASSES if self.stops_early else PASSES), self.densification
         timed = control.start is not None or control.until is not None or bool(control.reset_every)  # 0: never
         if enough >= self.iterations or timed or self.protocol == "paper" or self.time is not None:
             return self
@@ -384,6 +412,11 @@ class TrainSettings(HierarchySettings):
         if large is None or not is_large(size) or self.split is not None or self.nested or self.levels != 2:
             return self
         return replace(self, split=large)
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether views that are set aside decide the lengths of levels; a run that gets a time ends with that."""
+        return self.stop == AUTO and self.time is None
 
     @property
     def scheduled(self) -> int:
@@ -463,6 +496,7 @@ class TrainSettings(HierarchySettings):
                 "views_per_step": "1",
                 "sh_rate_factor": 1.0,
                 "decay": 1.0,
+                "stop": PLANNED,
                 "appearance": NONE,
                 "depth": NONE,
                 "normals": NONE,

@@ -29,6 +29,7 @@ from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.stages.view_transforms import ViewTransforms
 from lapgs_plugin.training.densification import DensityControl, scale_to_last
 from lapgs_plugin.training.dropout import thinned
+from lapgs_plugin.training.gains import StageGains
 from lapgs_plugin.training.joint import JointFields
 from lapgs_plugin.training.launches import LaunchPlanner, PlannedLaunch
 from lapgs_plugin.training.losses import LossOf, ViewLosses
@@ -88,6 +89,7 @@ class StageRun:
         geometry: supervises depth, normals and sky; None without.
         record: measures it.
         budget: decides the stage's length by the clock; None where it is planned.
+        gains: decides it by views that are set aside; None where they do not.
         say: shows a line to the user.
         joint: the finished fields while they are trained jointly; None before.
         loss: smoothed loss, NaN before the first iteration and after a finished stage.
@@ -110,6 +112,7 @@ class StageRun:
     record: StageRecord
     say: Callable[[str], None]
     budget: StageBudget | None = None
+    gains: StageGains | None = None
     joint: JointFields | None = None
     loss: float = math.nan
     step_views: int = 1
@@ -121,8 +124,8 @@ class StageRun:
         prepared, stage = self.prepared, self.stage
         settings = self._settings = prepared.settings
         self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
-        self._views = level_views(prepared.scene.train, stage.level)
-        self._steps = prepared.steps_of(stage)
+        self._views = self._trained_views()
+        self._steps = prepared.steps_of(stage, len(self._views))
         self._sums = StepSums(self._steps) if self._steps.shared else None
         for learned in filter(None, self.transforms.values()):
             learned.ranks = prepared.ranks
@@ -134,7 +137,7 @@ class StageRun:
             size_groups=prepared.size_groups(stage.level) if prepared.batches else None,
             joint_from=settings.joint_from(replace(stage, iterations=self.schedule.iterations)),
         )
-        self._dropout = settings.dropout_for(len(self._views))
+        self._dropout = settings.dropout_for(len(prepared.scene.train))
         # A residual that inherits its base's moments moves by them above its degree, too, and starts again at degree 0.
         self._inherits_moments = stage.signed and settings.inherit_mode == "full"
         self._losses = ViewLosses(
@@ -188,6 +191,34 @@ class StageRun:
         ranks, ended = self.prepared.ranks, self.counts.iteration >= self.stage.iterations
         if self.budget is not None and (ended or self._late_steps % ranks.steps_a_decision == 0):
             self._last(ranks.from_leader(self.budget.length(self.counts.iteration)))
+
+    def note_gains(self, psnrs: Sequence[float]) -> None:
+        """Let the stage have the iterations that views set aside gain by.
+
+        Args:
+            psnrs: of `PreparedRun.withheld` in dB, after the last iteration.
+        """
+        assert self.gains is not None
+        self.gains.note(self.counts.iteration, psnrs)
+        self._last(self.gains.planned)
+        if self.gains.decided is not None:
+            self._train_on(self._trained_views())
+
+    @property
+    def withholds(self) -> bool:
+        """Whether views are not trained on now, because the stage's length depends on them."""
+        return self.gains is not None and self.gains.decided is None
+
+    def _trained_views(self) -> tuple[LevelView, ...]:
+        prepared = self.prepared
+        withheld = {view.name for view in prepared.withheld} if self.withholds else set()
+        return level_views([view for view in prepared.scene.train if view.name not in withheld], self.stage.level)
+
+    def _train_on(self, views: tuple[LevelView, ...]) -> None:
+        """Train on these views from the next step on."""
+        self._views, self._steps = views, self.prepared.steps_of(self.stage, len(views))
+        self._planner = replace(self._planner, views=views, steps=self._steps)
+        self._scoring = replace(self._scoring, views=views, steps=self._steps)
 
     def _last(self, iterations: int) -> None:
         """Let the stage have so many iterations."""
@@ -530,6 +561,7 @@ class StageRun:
             "most_views": self._planner.most_views,
             "breakdown": self._breakdown.seconds(),
             "budget": None if self.budget is None else self.budget.state(),
+            "gains": None if self.gains is None else self.gains.state(),
             "model": self.model.state(),
             "densifier": self.densifier.state,
             "joint": None if self.joint is None else self.joint.state(),

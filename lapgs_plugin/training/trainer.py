@@ -26,6 +26,7 @@ from lapgs_plugin.stages.record import LoopCounts, StageRecord
 from lapgs_plugin.training.between_steps import BetweenSteps
 from lapgs_plugin.training.checkpoint import check_checkpoint, check_densifier, check_transforms
 from lapgs_plugin.training.evaluation import StageEvaluation
+from lapgs_plugin.training.gains import StageGains
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.planning import unpruned_levels
@@ -140,6 +141,19 @@ class Trainer:
             ends = now + (run_ends - now) * own / (own + sum(left))
         return StageBudget(self.clock, ends, run_ends, stage.iterations, len(self.prepared.scene.test))
 
+    def _gains(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageGains | None:
+        """Return what decides the length of a stage by views that are set aside; None without --stop auto.
+
+        None for finer levels, too, whose lengths are in proportion to the coarsest one's. Their first gains promise too
+        little: most comes when rates have fallen again, and of residuals when coarser levels are trained along.
+        """
+        if not self.prepared.settings.stops_early or stage.level < self.prepared.plan.levels - 1:
+            return None
+        most = self.prepared.planned[stage.level].iterations
+        if checkpoint is not None:
+            return StageGains(most, **checkpoint["gains"])
+        return StageGains(most, planned=most)
+
     def _say_what_is_chosen(self) -> None:
         """Tell the user the effect of the settings on this scene and device."""
         scene, say = self.prepared.scene, self.monitor.say
@@ -147,7 +161,12 @@ class Trainer:
         say(self._strategy_line())
         if (hooks := hooks_line(settings.hooks)) is not None:
             say(hooks)
-        if (few := few_views_line(len(scene.train), self.prepared.plan.iterations, bool(scene.test))) is not None:
+        if withheld := self.prepared.withheld:
+            say(
+                f"--stop auto: {len(withheld)} of {len(scene.train)} training views are set aside and decide when "
+                f"levels end, after {self.prepared.planned.iterations:,} iterations together at most"
+            )
+        elif (few := few_views_line(len(scene.train), self.prepared.plan.iterations, bool(scene.test))) is not None:
             say(few)
         if settings.dropout is None and (share := settings.dropout_for(len(scene.train))) > 0.0:
             say(f"{len(scene.train)} training views are few: --dropout {share:g} leaves Gaussians out at random")
@@ -185,9 +204,12 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
-        if checkpoint is not None and checkpoint["budget"] is not None:
-            self.prepared = self.prepared.lasting(stage.level, checkpoint["budget"]["planned"])
-            stage = self.prepared.plan[stage.level]
+        gains = self._gains(stage, checkpoint)
+        if gains is not None:
+            self.prepared = self.prepared.lasting(stage.level, gains.planned)
+        for decided in () if checkpoint is None else filter(None, (checkpoint["gains"], checkpoint["budget"])):
+            self.prepared = self.prepared.lasting(stage.level, decided["planned"])
+        stage = self.prepared.plan[stage.level]
         budget = self._budget(stage, checkpoint)
         prepared, aside = self.prepared, self.prepared.aside
         before = prepared.record_to_extend(stage)
@@ -200,7 +222,7 @@ class Trainer:
         with closing(images):
             if stage.signed:
                 predict_views(prepared, stage, images, record.overhead)
-            run = self._stage_run(stage, schedule, model, images, record, checkpoint, budget)
+            run = self._stage_run(stage, schedule, model, images, record, checkpoint, budget, gains)
             evaluation = StageEvaluation(run, self._quality, self.monitor)
             if checkpoint is not None:
                 evaluation.best = checkpoint.get("best")
@@ -298,6 +320,7 @@ class Trainer:
         record: StageRecord,
         checkpoint: dict[str, Any] | None,
         budget: StageBudget | None,
+        gains: StageGains | None,
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         prepared, poses = self.prepared, first_poses(self.prepared, stage)
@@ -317,6 +340,7 @@ class Trainer:
             record=record,
             say=self.monitor.say,
             budget=budget,
+            gains=gains,
         )
 
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:
@@ -335,6 +359,8 @@ class Trainer:
         stage, field = run.stage, run.model.field.detach()
         settings, archive = self.prepared.settings, self.prepared.archive
         record, joint = run.record.of_level(len(field)), run.joint
+        if run.gains is not None:
+            record = replace(record, decided=run.gains.length)
         along = {} if joint is None else joint.fields
         exposure = None if run.appearance is None else run.appearance.archived()
         grids = None if run.appearance is None else run.appearance.archived_grids()

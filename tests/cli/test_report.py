@@ -114,6 +114,19 @@ def test_a_level_that_lost_its_gaussians_is_said(run: Path) -> None:
     assert [levels[level]["start_gaussians"] for level in ("0", "1")] == [2001, 2500]
 
 
+def test_a_length_that_views_decided_is_said(run: Path) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    base, finest = manifest["records"]
+    base["decided"] = {"most": base["iterations"], "after": 6, "views": 4, "gain": 0.216}
+    finest["decided"] = {"most": 9000, "after": 6, "views": 4, "gain": -0.04}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    lapgs_report(run)
+    text = Page((run / "report.html").read_text()).text
+    for record, limit, gain in ((base, "the most it may have", "+0.22"), (finest, "of at most 9,000", "-0.04")):
+        length = f"Level {record['level']}: {record['iterations']} iterations, {limit}; after 6, 4 views set aside"
+        assert f"{length} promised {gain} dB for a third more." in text
+
+
 def test_a_finest_level_that_changes_little_is_said(run: Path) -> None:
     """By the views of metrics.json, here more of them than the scene has, if they were held out."""
     manifest = json.loads((run / "manifest.json").read_text())

@@ -18,6 +18,7 @@ from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training import preparation
 from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.preparation import TrainRequest, prepare
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.settings import Densification, TrainingControl, TrainSettings
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_runs import StopAt, plys
@@ -64,6 +65,10 @@ def trained(request: TrainRequest, monitor: Monitor | None = None) -> RunArchive
         (
             {"settings": replace(SHORT, time="9s"), "control": TrainingControl(gpu_busy=True)},
             "--gpu-busy with --time 9s",
+        ),
+        (
+            {"settings": replace(SHORT, stop="auto"), "control": TrainingControl(gpu_busy=True)},
+            "--gpu-busy with --stop auto",
         ),
         ({"settings": replace(SHORT, time="9s", levels=4), "chosen": frozenset()}, "level 3 of 4 would be 8x6 pixels"),
         ({"resume": True}, "is not a run, so there is nothing to continue"),
@@ -156,6 +161,47 @@ def test_an_unfinished_run_that_gets_a_time_ends_with_it(folder: Path, tmp_path:
         trained(replace(ends, settings=replace(SHORT, time="5s")))
     with pytest.raises(UserInputError, match=r"--iterations 20: the run in .* was trained for --time 4s"):
         trained(replace(ends, settings=SHORT, chosen=frozenset({"iterations"})))
+
+
+@pytest.mark.parametrize(("chosen", "most"), [(frozenset({"stop"}), 5000), (frozenset({"iterations"}), 30_000)])
+def test_a_run_that_views_end_has_iterations_at_most(
+    folder: Path, tmp_path: Path, chosen: frozenset[str], most: int
+) -> None:
+    said: list[str] = []
+    request = TrainRequest(folder, tmp_path / "run", TrainSettings(stop="auto"), chosen=chosen)
+    with prepare(request, said.append) as run:
+        assert run.planned.iterations == run.archive.manifest.settings["iterations"] == most
+        assert (len(run.scene.train), len(run.withheld)) == (16, 3)
+    assert any("16 training photos: at most 5,000 iterations" in line for line in said) is (most == 5000)
+
+
+def test_a_run_that_views_ended_is_over(folder: Path, tmp_path: Path) -> None:
+    first = TrainRequest(folder, tmp_path / "run", replace(SHORT, iterations=40, stop="auto"))
+    archive = trained(first)
+    again, files = replace(first, resume=True, chosen=frozenset()), plys(archive)
+    assert plys(trained(again)) == files
+    with pytest.raises(UserInputError, match=r"--iterations 50: the run in .* was trained with --stop auto"):
+        trained(replace(again, settings=replace(SHORT, iterations=50), chosen=frozenset({"iterations"})))
+    with pytest.raises(UserInputError, match=r"--stop asks for planned, but the run in .* was started with auto"):
+        trained(replace(again, settings=SHORT, chosen=frozenset({"stop"})))
+
+
+def test_a_run_that_views_end_is_of_one_process(folder: Path, tmp_path: Path) -> None:
+    class Two(Ranks):
+        size = 2
+
+        @property
+        def together(self) -> str:
+            return "2 ranks"
+
+    first = TrainRequest(folder, tmp_path / "run", replace(SHORT, stop="auto"), ranks=Two())
+    with pytest.raises(UserInputError, match="2 ranks with --stop auto: ends runs of one process alone"):
+        prepare(first)
+    with pytest.raises(TrainingStoppedError):
+        trained(replace(first, ranks=ALONE), StopAt(0, 11))
+    again = replace(first, settings=SHORT, resume=True, chosen=frozenset())
+    with pytest.raises(UserInputError, match="2 ranks with --stop auto"), prepare(again):
+        pass
 
 
 def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
