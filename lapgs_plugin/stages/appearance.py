@@ -145,7 +145,7 @@ class ViewGrids(ViewAppearance):
     """Hold and optimize a bilateral grid (y, x, l, 12) of each training view.
 
     At each brightness, the mean over all views and places is the identity: a tone curve that all photos share can be
-    the field's. A pattern over the image that they share, such as vignetting, cannot, and stays.
+    the field's. A pattern over the image that they share cannot, and stays.
     """
 
     WARM_UP: ClassVar[float] = 1 / 30  # 1,000 of 30,000 iterations, as in nerfstudio and gsplat

@@ -23,7 +23,7 @@ from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.runs.neighbours import predicted_exposures
-from lapgs_plugin.scenes.exposure import measure_exposure
+from lapgs_plugin.scenes.exposure import measure_exposure, sparse_colors
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.stages.appearance import DIFFERENT, ViewColors, from_gains, identities
 from lapgs_plugin.training.settings import TrainSettings
@@ -53,16 +53,17 @@ def test_transform_and_its_gradients_are_the_closed_form() -> None:
 
 def test_measure_finds_the_gains_of_photos() -> None:
     scene = wall_scene(STOPS)
-    measured = measure_exposure(scene)
+    measured = measure_exposure(scene, sparse_colors(scene))
     expected = torch.tensor(STOPS) - torch.tensor(STOPS).median()
     torch.testing.assert_close(measured.gains, expected[:, None].repeat(1, 3), atol=0.03, rtol=0)  # worst seen 0.005
     assert measured.spread > 0.4
-    alike = measure_exposure(wall_scene((0.0,) * 6))
+    alike_scene = wall_scene((0.0,) * 6)
+    alike = measure_exposure(alike_scene, sparse_colors(alike_scene))
     assert alike.spread < 0.01
     assert alike.gains.abs().max() < 0.03
     assert DIFFERENT > 0.01
     grey = replace(scene, colors=torch.full_like(scene.points, 0.5))  # as those that a scene without points gets
-    assert measure_exposure(grey).spread == 0
+    assert measure_exposure(grey, sparse_colors(grey)).spread == 0
 
 
 def wall_scene(stops: tuple[float, ...]) -> Scene:

@@ -19,7 +19,7 @@ TONES = 8
 MOST_NODES = 16
 """Most nodes along a side of a grid, as in the literature."""
 LEAST_NODES = 4
-"""Fewest nodes along a side of a grid, for vignetting."""
+"""Fewest nodes along a side of a grid."""
 CELL = 32
 """Fewest pixels of a photo between two nodes, where `LEAST_NODES` allows it: finer grids learn what a photo shows."""
 
