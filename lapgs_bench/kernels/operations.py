@@ -88,21 +88,21 @@ def benchmark(
     generator = torch.Generator().manual_seed(0)
     images = [torch.rand(3, height, width, generator=generator).to(device) for _ in range(2)]
     coarse = torch.rand(3, (height + 1) // 2, (width + 1) // 2, generator=generator).to(device)
-    operations = {
-        "upsample": _upsample_versions(ours, coarse, images[0]),
-        "photometric loss": _loss_versions(ours, images[0], images[1]),
-        "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
-        "Adam": _adam_versions(ours, gaussians, device),
-        "densification statistics": _statistics_versions(ours, gaussians, device),
-        "regularization": _regularization_versions(ours, gaussians, device),
-        "position noise": _noise_versions(ours, gaussians, device),
-        "colour transform": _transform_versions(images[0]),
-        "bilateral grid": _grid_versions(images[0]),
-        "variation of 50 grids": _variation_versions((width, height), device),
+    operations: dict[str, Callable[[], Versions]] = {
+        "upsample": lambda: _upsample_versions(ours, coarse, images[0]),
+        "photometric loss": lambda: _loss_versions(ours, images[0], images[1]),
+        "residual's loss": lambda: _loss_versions(ours, images[0], images[1], coarse),
+        "Adam": lambda: _adam_versions(ours, gaussians, device),
+        "densification statistics": lambda: _statistics_versions(ours, gaussians, device),
+        "regularization": lambda: _regularization_versions(ours, gaussians, device),
+        "position noise": lambda: _noise_versions(ours, gaussians, device),
+        "colour transform": lambda: _transform_versions(images[0]),
+        "bilateral grid": lambda: _grid_versions(images[0]),
+        "variation of 50 grids": lambda: _variation_versions((width, height), device),
     }
     if device.type == "cuda":
-        operations["Adam of a checkout"] = _checkout_adam_versions(gaussians, device)
-    return [one for op, versions in operations.items() if only in op for one in _time(op, versions, device, repeats)]
+        operations["Adam of a checkout"] = lambda: _checkout_adam_versions(gaussians, device)
+    return [one for op, versions in operations.items() if only in op for one in _time(op, versions(), device, repeats)]
 
 
 def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> list[OpTime]:
