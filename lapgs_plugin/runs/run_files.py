@@ -6,7 +6,9 @@ import json
 import logging
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from lapgs_plugin.errors import RunFolderError, printable
 from lapgs_plugin.files import FolderLock, one_line_errors, require_own_entries, write_text
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-Falloffs = dict[str, float]
+Falloffs = dict[str, Annotated[float, Field(ge=-20, le=0)]]
 """Brightness of the corners of views' photos in stops, by view: of those whose camera darkens them."""
 
 

@@ -147,6 +147,7 @@ def test_stopped_run_continues_with_its_falloff_to_the_same_bits(tmp_path: Path)
 def test_damaged_falloffs_are_refused(tmp_path: Path) -> None:
     archive = train(tmp_path / "run", ring_scene(), TrainSettings(iterations=12, levels=1, sh_degree=0))
     assert archive.vignetting() == {}
-    archive.path(VIGNETTING).write_text('{"view_1.png": "dark"}')
-    with pytest.raises(RunFolderError, match=r"vignetting\.json.*train again with --overwrite"):
-        RunArchive.open(tmp_path / "run").vignetting()
+    for damaged in ('"dark"', "1.5", "-1e9", "NaN"):
+        archive.path(VIGNETTING).write_text(f'{{"view_1.png": {damaged}}}')
+        with pytest.raises(RunFolderError, match=r"vignetting\.json.*train again with --overwrite"):
+            RunArchive.open(tmp_path / "run").vignetting()
