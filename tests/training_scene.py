@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -64,3 +65,31 @@ def ring_scene(train: int = 6, test: int = 2, size: tuple[int, int] = (WIDTH, HE
         extent=4.4,
         background=(0.0, 0.0, 0.0),
     )
+
+
+def panned_scene() -> Scene:
+    """A smoothly coloured plane z = 0 before cameras that pass it, so that a place is in the middle and in corners."""
+    width, height = 56, 40
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    across = 3 * torch.stack([x - width / 2, y - height / 2], -1) / (0.9 * width)  # (h, w, 2) on the plane
+    views = []
+    for index in range(20):
+        place = torch.tensor([0.6 * (index // 4) + 0.1 * (index % 4) - 1.2, 0.6 * (index % 4) - 0.9])
+        pose = torch.eye(4)
+        pose[:3, 3] = torch.tensor([*-place, 3.0])
+        camera = Camera(width, height, 0.9 * width, 0.9 * width, width / 2, height / 2, pose)
+        views.append(View(f"{index:02d}.png", camera, plane_colors(across + place).permute(2, 0, 1).contiguous()))
+    points = torch.rand(1200, 2, generator=torch.Generator().manual_seed(1)) * torch.tensor([6.0, 5.0])
+    points = points - torch.tensor([3.0, 2.5])
+    return replace(
+        ring_scene(),
+        train=tuple(view for index, view in enumerate(views) if index not in (6, 9, 14)),
+        test=tuple(views[index] for index in (6, 9, 14)),
+        points=torch.cat([points, torch.zeros(1200, 1)], dim=1),
+        colors=plane_colors(points),
+    )
+
+
+def plane_colors(places: Tensor) -> Tensor:
+    """Return the colours (..., 3) of places (..., 2) on the plane."""
+    return 0.45 + 0.2 * torch.sin(places @ torch.tensor([[3.0, 1.5], [-2.25, 3.0], [1.5, -3.75]]).T)

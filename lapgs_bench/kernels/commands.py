@@ -203,10 +203,12 @@ def ops(
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|cuda", help="Where to run; auto takes a GPU if there is one.")
     ] = "auto",
+    only: Annotated[str, typer.Option(metavar="TEXT", help="Time the operations whose names have this text.")] = "",
 ) -> None:
     """Time each operation of a training iteration in every version that this machine has.
 
-    Speed-ups and differences are against PyTorch's operations. Other libraries have their own names.
+    "GPU ms" is the time of the kernels, "ms" that of a call on its own, with its start by the processor. Speed-ups and
+    differences are against PyTorch's operations. Other libraries have their own names.
     """
     import torch
 
@@ -215,10 +217,14 @@ def ops(
 
     where = torch.device(chosen_device(device))
     title = f"Operations at {width}x{height} with {gaussians} Gaussians on {where}"
-    table = _titled_table(title, ("operation", "version"), ("ms", "speed-up", "difference"))
-    shown = ""
-    for time in benchmark(where, width, height, gaussians, repeats):
+    clocks = ("ms", "GPU ms") if where.type == "cuda" else ("ms",)
+    table = _titled_table(title, ("operation", "version"), (*clocks, "speed-up", "difference"))
+    times, shown = benchmark(where, width, height, gaussians, repeats, only), ""
+    if not times:
+        raise UserInputError(f"--only {only}: no operation's name has this text; without it all are timed")
+    for time in times:
         name = "" if time.op == shown else time.op
-        table.add_row(name, time.version, f"{time.milliseconds:.2f}", f"{time.ratio:.2f}", f"{time.difference:.0e}")
+        measured = [f"{one:.3f}" for one in (time.milliseconds, time.busy) if one is not None]
+        table.add_row(name, time.version, *measured, f"{time.ratio:.2f}", f"{time.difference:.0e}")
         shown = time.op
     make_console().print(table)

@@ -18,6 +18,7 @@ from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops import (
     adam,
+    bilateral_grid,
     color_transform,
     densification_statistics,
     photometric_loss,
@@ -28,6 +29,7 @@ from lapgs_plugin.ops import (
 from lapgs_plugin.ops.adam import multi_tensor
 from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
+from lapgs_plugin.ops.bilateral_grid.in_torch import add_variation_torch, slice_grids_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch
 from lapgs_plugin.ops.photometric_loss.in_torch import DEFAULT_SSIM_WEIGHT, photometric_loss_torch
@@ -57,6 +59,7 @@ class OpTime:
 
     Attributes:
         milliseconds: median over all turns.
+        busy: milliseconds in which the GPU runs it, without waiting for the processor; None on a CPU.
         ratio: time of the PyTorch version over this one's.
         difference: largest difference from the PyTorch version's result after one call.
     """
@@ -64,29 +67,42 @@ class OpTime:
     op: str
     version: str
     milliseconds: float
+    busy: float | None
     ratio: float
     difference: float
 
 
-def benchmark(device: torch.device, width: int, height: int, gaussians: int, repeats: int) -> list[OpTime]:
-    """Time all operations; the versions of one take turns, so that a change in the machine's load meets all of them."""
+def benchmark(
+    device: torch.device, width: int, height: int, gaussians: int, repeats: int, only: str = ""
+) -> list[OpTime]:
+    """Time operations; the versions of one take turns, so that a change in the machine's load meets all of them.
+
+    Args:
+        device: of all tensors.
+        width, height: of images.
+        gaussians: of the field.
+        repeats: turns of each version.
+        only: part of the names of the operations to time.
+    """
     ours = "Triton" if device.type == "cuda" else NUMBA
     generator = torch.Generator().manual_seed(0)
     images = [torch.rand(3, height, width, generator=generator).to(device) for _ in range(2)]
     coarse = torch.rand(3, (height + 1) // 2, (width + 1) // 2, generator=generator).to(device)
-    operations = {
-        "upsample": _upsample_versions(ours, coarse, images[0]),
-        "photometric loss": _loss_versions(ours, images[0], images[1]),
-        "residual's loss": _loss_versions(ours, images[0], images[1], coarse),
-        "Adam": _adam_versions(ours, gaussians, device),
-        "densification statistics": _statistics_versions(ours, gaussians, device),
-        "regularization": _regularization_versions(ours, gaussians, device),
-        "position noise": _noise_versions(ours, gaussians, device),
-        "colour transform": _transform_versions(images[0]),
+    operations: dict[str, Callable[[], Versions]] = {
+        "upsample": lambda: _upsample_versions(ours, coarse, images[0]),
+        "photometric loss": lambda: _loss_versions(ours, images[0], images[1]),
+        "residual's loss": lambda: _loss_versions(ours, images[0], images[1], coarse),
+        "Adam": lambda: _adam_versions(ours, gaussians, device),
+        "densification statistics": lambda: _statistics_versions(ours, gaussians, device),
+        "regularization": lambda: _regularization_versions(ours, gaussians, device),
+        "position noise": lambda: _noise_versions(ours, gaussians, device),
+        "colour transform": lambda: _transform_versions(images[0]),
+        "bilateral grid": lambda: _grid_versions(images[0]),
+        "variation of 50 grids": lambda: _variation_versions((width, height), device),
     }
     if device.type == "cuda":
-        operations["Adam of a checkout"] = _checkout_adam_versions(gaussians, device)
-    return [one for op, versions in operations.items() for one in _time(op, versions, device, repeats)]
+        operations["Adam of a checkout"] = lambda: _checkout_adam_versions(gaussians, device)
+    return [one for op, versions in operations.items() if only in op for one in _time(op, versions(), device, repeats)]
 
 
 def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> list[OpTime]:
@@ -106,8 +122,24 @@ def _time(op: str, versions: Versions, device: torch.device, repeats: int) -> li
             wait()
             seconds[name].append(time.perf_counter() - start)
     medians = {name: median(turns) for name, turns in seconds.items()}
+    busy = {name: _busy(version.run) if device.type == "cuda" else None for name, version in versions.items()}
     differences = {name: float((result - results[TORCH]).abs().max()) for name, result in results.items()}
-    return [OpTime(op, name, 1e3 * own, medians[TORCH] / own, differences[name]) for name, own in medians.items()]
+    return [
+        OpTime(op, name, 1e3 * own, busy[name], medians[TORCH] / own, differences[name])
+        for name, own in medians.items()
+    ]
+
+
+def _busy(run: Callable[[], object], calls: int = 10) -> float:
+    """Return the GPU's milliseconds for one of several calls that wait for it in its queue."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]  # torch's
+    torch.cuda._sleep(50_000_000)  # type: ignore[no-untyped-call]  # cycles, longer than it takes to start the calls
+    start.record()
+    for _ in range(calls):
+        run()
+    end.record()
+    end.synchronize()
+    return float(start.elapsed_time(end)) / calls
 
 
 def _upsample_versions(ours: str, coarse: Tensor, fine: Tensor) -> Versions:
@@ -168,6 +200,37 @@ def _transform_versions(image: Tensor) -> Versions:
     versions = {TORCH: gradients_of(transform_colors_torch)}
     if color_transform.triton_works(image):
         versions["Triton"] = gradients_of(color_transform.transform_colors)
+    return versions
+
+
+def _grid_versions(image: Tensor) -> Versions:
+    """Return versions of slicing a grid and of both gradients, of an image with interleaved colours."""
+    size = image.shape[-1], image.shape[-2]
+    leaf = image.permute(1, 2, 0).contiguous().permute(2, 0, 1).requires_grad_()
+    (grids,) = bilateral_grid.uniform_grids(torch.eye(3, 4, device=image.device)[None], bilateral_grid.grid_nodes(size))
+    grids.requires_grad_()
+    by_out = leaf.detach().flip(-1)
+
+    def gradients_of(slice_grids: Callable[[Tensor, Tensor], Tensor]) -> Version:
+        return Version(lambda: torch.autograd.grad(slice_grids(leaf, grids), (leaf, grids), by_out)[0])
+
+    versions = {TORCH: gradients_of(slice_grids_torch)}
+    if bilateral_grid.triton_works(image):
+        versions["Triton"] = gradients_of(bilateral_grid.slice_grids)
+    return versions
+
+
+def _variation_versions(size: tuple[int, int], device: torch.device) -> Versions:
+    nodes = bilateral_grid.grid_nodes(size)
+    grids = torch.rand(50, *nodes, 12, generator=torch.Generator().manual_seed(0)).to(device)
+
+    def version(add: Callable[[Tensor, Tensor, float], None]) -> Version:
+        by_grids = torch.zeros_like(grids)
+        return Version(lambda: add(grids, by_grids, 1.0), by_grids)
+
+    versions = {TORCH: version(add_variation_torch)}
+    if bilateral_grid.triton_works(grids):
+        versions["Triton"] = version(bilateral_grid.add_variation)
     return versions
 
 

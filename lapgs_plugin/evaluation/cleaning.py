@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.evaluation.figures import learned_exposures, level_psnrs
+from lapgs_plugin.evaluation.figures import level_psnrs, photo_looks
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.crop import Crop
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -101,11 +101,11 @@ def clean_levels(
         floating = find_floaters(before, cameras) if floaters else nothing
         left = {level: fields[level].kept(inside[level] & ~floating[level]) for level in fields}
         after = replace(before, fields=left, offload=FieldOffload(placed.device))
-        exposures = learned_exposures(archive, [view.name for view in scene.train])
+        looks = photo_looks(archive, [view.name for view in scene.train])
         both = []
         with item_progress("views") as progress:
             for view in progress.track(scene.train, description="Measuring training views"):
-                both.append([level_psnrs(view, one, exposures.get(view.name)) for one in (before, after)])
+                both.append([level_psnrs(view, one, looks[view.name]) for one in (before, after)])
     cleaned = {}
     for level, field in left.items():
         psnrs = [fmean(pair[which][level] for pair in both) for which in (0, 1)]

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -36,6 +37,7 @@ from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import Composition, to_full_size
+from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.options import WHERE_TRAINED, RenderOptions
@@ -93,10 +95,10 @@ def evaluate_run(
             split, photos = "other", tuple(sorted((*scene.train, *scene.test), key=lambda view: view.name))
         smallest = min(min(view.camera.size) for view in photos)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
-        exposures = learned_exposures(archive, [view.name for view in photos])
+        looks = photo_looks(archive, [view.name for view in photos])
         with item_progress("views") as progress:
             measured = [
-                _measure_view(view, renderer.render(view.camera), renderer, distances, exposures.get(view.name))
+                _measure_view(view, renderer.render(view.camera), renderer, distances, looks[view.name])
                 for view in progress.track(
                     with_pixels(photos), total=len(photos), description=f"Measuring {MEASURED[split]} views"
                 )
@@ -123,23 +125,23 @@ def evaluate_run(
         "fps": speed.fps,
         "masked": any(view.masked for view in photos),
         "exposure_compensated": archive.exposure(archive.available_levels[-1]) is not None,
-        "exposure_predicted": bool(exposures),
+        "exposure_predicted": any(look.exposure is not None for look in looks.values()),
     }
     archive.write_metrics(metrics)
     return metrics
 
 
 def _measure_view(
-    view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics, exposure: Tensor | None
+    view: View, composition: Composition, renderer: HierarchyRenderer, lpips: LpipsMetrics, look: PhotoLook
 ) -> tuple[dict[str, Any], dict[int, dict[str, float]]]:
     """Compare a rendered view with its photo at every level, inside of its mask, on the renderer's device.
 
-    The render first gets the photo's exposure, a (3, 4) colour transform, if there is one.
+    The render first gets the photo's look.
 
     Returns:
         The view's entry of "views", and its figures for "levels" by level.
     """
-    composed, targets = _exposed(composition, exposure), _targets(view, renderer)
+    composed, targets = _photographed(composition, look), _targets(view, renderer)
     photo, mask = view.image.to(renderer.device), None if view.mask is None else view.mask.to(renderer.device)
     levels = {
         level: {
@@ -160,27 +162,44 @@ def _measure_view(
     return figures, levels
 
 
-def level_psnrs(view: View, renderer: HierarchyRenderer, exposure: Tensor | None) -> dict[int, float]:
+def level_psnrs(view: View, renderer: HierarchyRenderer, look: PhotoLook) -> dict[int, float]:
     """Return the PSNR in dB of a view's composed image at each level, against the photo at the level's size.
 
-    The render first gets the photo's exposure, a (3, 4) colour transform, if there is one.
+    The render first gets the photo's look.
     """
-    composed, targets = _exposed(renderer.render(view.camera, renderer.finest), exposure), _targets(view, renderer)
+    composed, targets = _photographed(renderer.render(view.camera, renderer.finest), look), _targets(view, renderer)
     return {level: psnr(image, *targets[level]) for level, image in composed.items()}
 
 
-def learned_exposures(archive: RunArchive, views: Iterable[str]) -> dict[str, Tensor]:
-    """Return the colour transforms (3, 4) that a run learned, or predicts, of views; empty without compensation."""
+@dataclass(frozen=True)
+class PhotoLook:
+    """Hold how a photo differs from a render of its view.
+
+    Attributes:
+        falloff: brightness of its corners in stops, see `measure_vignetting`.
+        exposure: (3, 4) colour transform; None if it is not known.
+    """
+
+    falloff: float
+    exposure: Tensor | None
+
+    def of(self, image: Tensor) -> Tensor:
+        """Return a rendered image (3, h, w) as it is photographed."""
+        image = vignette(image, [self.falloff])
+        return image if self.exposure is None else transform_colors(image, self.exposure.to(image))
+
+
+def photo_looks(archive: RunArchive, views: Iterable[str]) -> dict[str, PhotoLook]:
+    """Return the looks that a run learned, or predicts, of views."""
+    views, falloffs = list(views), archive.vignetting()
     learned = archive.exposure(archive.available_levels[-1])
-    return {} if learned is None else predicted_exposures(learned, views)
+    exposures = {} if learned is None else predicted_exposures(learned, views)
+    return {name: PhotoLook(falloffs.get(name, 0.0), exposures.get(name)) for name in views}
 
 
-def _exposed(composition: Composition, exposure: Tensor | None) -> Mapping[int, Tensor]:
-    """Return the composed images by level, with a photo's exposure if there is one."""
-    composed = composition.composed
-    if exposure is None:
-        return composed
-    return {level: transform_colors(image, exposure.to(image)) for level, image in composed.items()}
+def _photographed(composition: Composition, look: PhotoLook) -> Mapping[int, Tensor]:
+    """Return the composed images by level with a photo's look."""
+    return {level: look.of(image) for level, image in composition.composed.items()}
 
 
 def _targets(view: View, renderer: HierarchyRenderer) -> list[tuple[Tensor, Tensor | None]]:

@@ -347,10 +347,10 @@ class RunArchive(RunFiles):
         learned = read_tensors(path, advice)
         shapes = {getattr(grid, "shape", None) for grid in learned.values()}
         for name, grid in learned.items():
-            fits = isinstance(grid, Tensor) and grid.dtype == torch.float32 and grid.ndim == 4 and len(grid) == 12
+            fits = isinstance(grid, Tensor) and grid.dtype == torch.float32 and grid.ndim == 4 and grid.shape[-1] == 12
             if not (fits and grid.numel() > 0 and len(shapes) == 1 and bool(torch.isfinite(grid).all())):
                 raise RunFolderError(
-                    f"{path}: {name} is no bilateral grid, expected finite float32 (12, l, y, x), of one shape for all "
+                    f"{path}: {name} is no bilateral grid, expected finite float32 (y, x, l, 12), of one shape for all "
                     f"photos; {advice}"
                 )
         return learned

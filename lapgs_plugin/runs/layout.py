@@ -2,6 +2,7 @@
 
     RUN/manifest.json              everything needed to render the run again
     RUN/view_cameras.json          cameras of the run's views where they are not those of its scene
+    RUN/vignetting.json            brightness of the corners of views' photos in stops, where a camera darkens them
     RUN/level_<l>/point_cloud.ply  the field of each finished level, a standard 3DGS PLY
     RUN/level_<l>/optimizer.pt     its optimizer state, only while the next level may inherit it
     RUN/level_<l>/view_colors.json colour transforms of the training photos after that level, with --appearance
@@ -52,7 +53,7 @@ from lapgs_plugin.untrusted import TEXT_BYTES, read_json
 HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
-CAMERAS = "view_cameras.json"
+CAMERAS, VIGNETTING = "view_cameras.json", "vignetting.json"
 TILES, TILE = "tiles.json", "tile_{}_{}"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
@@ -155,10 +156,10 @@ def exists(path: Path) -> bool:
 
 def require_own_results(folder: Path) -> None:
     """Check that all that is written in a run folder is its own, see `files.require_own_entries`."""
-    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS, TILES)
+    files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS, VIGNETTING)
     with one_line_errors(folder, "read"):
         parts = [path.name for pattern in ("level_*", TILE.format("*", "*")) for path in folder.glob(pattern)]
-    require_own_entries(folder, (*files, RENDERS, EXPORT, TENSORBOARD, CACHE, *parts))
+    require_own_entries(folder, (*files, TILES, RENDERS, EXPORT, TENSORBOARD, CACHE, *parts))
 
 
 def is_run(folder: Path) -> bool:
@@ -194,7 +195,7 @@ def has_begun(folder: Path) -> bool:
 def remove_results(folder: Path) -> None:
     """Remove the files of a previous run and nothing else."""
     remove_scratch(folder)
-    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS, TILES):
+    for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS, VIGNETTING, TILES):
         (folder / name).unlink(missing_ok=True)
     for name in (RENDERS, EXPORT, TENSORBOARD):
         if (folder / name).is_dir():

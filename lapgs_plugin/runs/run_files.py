@@ -6,11 +6,22 @@ import json
 import logging
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from lapgs_plugin.errors import RunFolderError, printable
 from lapgs_plugin.files import FolderLock, one_line_errors, require_own_entries, write_text
-from lapgs_plugin.runs.layout import CAMERAS, CHECKPOINT, FORGET_EXTENSION, HISTORY, METRICS, STABILITY, exists
+from lapgs_plugin.runs.layout import (
+    CAMERAS,
+    CHECKPOINT,
+    FORGET_EXTENSION,
+    HISTORY,
+    METRICS,
+    STABILITY,
+    VIGNETTING,
+    exists,
+)
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import HistoryEntry, Metrics
 from lapgs_plugin.runs.tensors import read_tensors, write_tensors
@@ -21,6 +32,10 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 logger = logging.getLogger(__name__)
+
+
+Falloffs = dict[str, Annotated[float, Field(ge=-20, le=0)]]
+"""Brightness of the corners of views' photos in stops, by view: of those whose camera darkens them."""
 
 
 class RunFiles:
@@ -163,6 +178,24 @@ class RunFiles:
             return None
         table = read_json(path, CameraTable, error=RunFolderError, advice="train again with --overwrite")
         return TrainedCameras.from_json(table, str(path))
+
+    def write_vignetting(self, falloffs: Falloffs) -> None:
+        """Replace the falloffs of views; without any, nothing is written."""
+        self._require_lock()
+        if falloffs:
+            self._write_json(self.path(VIGNETTING), falloffs, training=True)
+
+    def vignetting(self) -> Falloffs:
+        """Read the falloffs of views, as `ops.vignetting` describes them; empty without.
+
+        Raises:
+            RunFolderError: the file is damaged.
+        """
+        path = self.path(VIGNETTING)
+        if not exists(path):
+            return {}
+        falloffs: Falloffs = read_json(path, Falloffs, error=RunFolderError, advice="train again with --overwrite")
+        return falloffs
 
     def save_checkpoint(self, state: dict[str, Any], extends_to: int | None = None) -> None:
         """Replace the checkpoint of the level in training.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -52,25 +53,52 @@ class MeasuredExposure:
     spread: float
 
 
+class SparseColors(NamedTuple):
+    """Hold the colours of sparse points in the training photos.
+
+    Attributes:
+        points: (n, 3) in the world.
+        colors: (v, n, 3) in each photo, 0 where a point is not seen.
+        right: (v, n) bool, which points are in a photo's right half.
+    """
+
+    points: Tensor  # (n, 3)
+    colors: Tensor  # (v, n, 3)
+    right: Tensor  # (v, n)
+
+
 LookUp = Callable[[Tensor], Sequence[tuple[Tensor, Tensor]]]
 """Returns `colors_at` of all training photos at sparse points (n, 3)."""
 
 
-def measure_exposure(scene: Scene, look_up: LookUp | None = None) -> MeasuredExposure:
-    """Measure how the exposure of a scene's training photos differs.
-
-    The spread is 0 if too few points are visible, or if all have one colour, as random points do.
+def sparse_colors(scene: Scene, look_up: LookUp | None = None) -> SparseColors | None:
+    """Look up sparse points in all training photos; None if all have one colour, as random points do.
 
     Args:
         scene: with its photos.
         look_up: reads the photos in another way than one after the other.
     """
     if len(scene.points) and bool((scene.colors == scene.colors[0]).all()):
-        return MeasuredExposure(torch.zeros(len(scene.train), 3), 0.0)
+        return None
     chosen = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:POINTS]
     points = scene.points[chosen]
     looked_up = [colors_at(view, points) for view in scene.train] if look_up is None else look_up(points)
-    colors, right = (torch.stack(views) for views in zip(*looked_up, strict=True))  # (v, n, 3), (v, n)
+    colors, right = (torch.stack(views) for views in zip(*looked_up, strict=True))
+    return SparseColors(points, colors, right)
+
+
+def measure_exposure(scene: Scene, seen: SparseColors | None) -> MeasuredExposure:
+    """Measure how the exposure of a scene's training photos differs.
+
+    The spread is 0 if too few points are visible.
+
+    Args:
+        scene: whose photos they are.
+        seen: of its training photos; None if they cannot be compared.
+    """
+    if seen is None:
+        return MeasuredExposure(torch.zeros(len(scene.train), 3), 0.0)
+    _, colors, right = seen
     usable = ((colors > DARKEST) & (colors < BRIGHTEST)).all(-1)  # (v, n)
     often = usable.sum(0) >= LEAST_VIEWS
     usable, right = usable[:, often], right[:, often]
@@ -81,12 +109,12 @@ def measure_exposure(scene: Scene, look_up: LookUp | None = None) -> MeasuredExp
     gains = torch.zeros(len(scene.train), 3)
     if int(known.sum()) < LEAST_VIEWS:
         return MeasuredExposure(gains, 0.0)
-    weights = _agreement(brightness, usable)
-    _, points = _solve(brightness, weights)
+    weights = agreement(brightness, usable)
+    _, points = solve_gains(brightness, weights)
     left, other = (_modes(brightness - points, half)[known] for half in halves)
     left, other = left - left.median(), other - other.median()
     for channel in range(3):
-        logarithms, _ = _solve(colors[..., channel].log2(), weights)
+        logarithms, _ = solve_gains(colors[..., channel].log2(), weights)
         gains[known, channel] = (logarithms - logarithms[known].median())[known]
     agreed, disagreed = (_robust_deviation((left + sign * other) / 2) for sign in (1, -1))
     return MeasuredExposure(gains, math.sqrt(max(0.0, agreed**2 - disagreed**2)))
@@ -110,27 +138,33 @@ def colors_at(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
 
 def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Project points: x and y (n,) in image widths and heights, and which are visible (n,)."""
-    x, y, depth = camera.local(points).unbind(-1)
-    x = (camera.fx * x / depth + camera.cx) / camera.width
-    y = (camera.fy * y / depth + camera.cy) / camera.height
+    x, y, depth = place_in_image(camera, points)
     inside = (depth > 0) & (x > 0) & (x < 1) & (y > 0) & (y < 1)
     cell = torch.where(inside, (CELLS * y).floor() * CELLS + (CELLS * x).floor(), 0.0).long()
     nearest = torch.full((CELLS * CELLS,), math.inf).scatter_reduce(0, cell[inside], depth[inside], "amin")
     return x, y, inside & (depth <= nearest[cell] * DEPTH_MARGIN)
 
 
-def _agreement(values: Tensor, usable: Tensor) -> Tensor:
+def place_in_image(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Project points: x and y (n,) in image widths and heights, and their depths (n,)."""
+    x, y, depth = camera.local(points).unbind(-1)
+    x = (camera.fx * x / depth + camera.cx) / camera.width
+    y = (camera.fy * y / depth + camera.cy) / camera.height
+    return x, y, depth
+
+
+def agreement(values: Tensor, usable: Tensor) -> Tensor:
     """Return weights (v, n) of the usable values of photos and points: near 0 where a photo sees something else."""
     gains = values.new_zeros(len(values))
     points = torch.where(usable, values, math.nan).nanmedian(dim=0).values.nan_to_num()
     weights = usable.float()
     for bandwidth in BANDWIDTHS:
         weights = torch.exp(-(((values - gains[:, None] - points) / bandwidth) ** 2)) * usable
-        gains, points = _solve(values, weights)
+        gains, points = solve_gains(values, weights)
     return weights
 
 
-def _solve(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def solve_gains(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return gains (v,) of photos and values (n,) of points whose sums are closest to values (v, n), in least squares.
 
     Solved for all photos at once, because gains are related only between photos that see the same points.

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.hierarchy.settings import AFFINE, BILATERAL
-from lapgs_plugin.ops.bilateral_grid import grid_nodes, slice_grids, total_variation, uniform_grids
+from lapgs_plugin.ops.bilateral_grid import add_variation, grid_nodes, slice_grids, uniform_grids
+from lapgs_plugin.ops.bilateral_grid import triton_works as grids_in_triton
 from lapgs_plugin.ops.color_transform import transform_colors, triton_works
 from lapgs_plugin.ops.mixed_sizes import Sizes
 from lapgs_plugin.runs.archive import Exposures, Grids, RunArchive
@@ -94,11 +95,18 @@ class ViewAppearance(ViewTransforms):
         return None
 
     def _chosen(self, names: Sequence[str]) -> Tensor:
-        """Return the transforms (b, ...) of some views."""
-        if len(names) == 1:
-            return self.transforms[self._index[names[0]]][None]
-        places = torch.tensor([self._index[name] for name in names])
-        return self.transforms.index_select(0, places.to(self.transforms.device, non_blocking=True))
+        """Return the transforms (b, ...) of some views, whose gradients are added to theirs alone.
+
+        Autograd's gradient of an indexed tensor is as large as those of all views, zeros but for the chosen ones.
+        """
+        if self.transforms.grad is None:
+            self.transforms.grad = torch.zeros_like(self.transforms)
+        chosen = []
+        for index in (self._index[name] for name in names):
+            leaf = self.transforms.detach()[index].requires_grad_()
+            leaf.grad = self.transforms.grad[index]  # which autograd adds to in place
+            chosen.append(leaf)
+        return chosen[0][None] if len(chosen) == 1 else torch.stack(chosen)
 
 
 class ViewColors(ViewAppearance):
@@ -134,14 +142,18 @@ class ViewColors(ViewAppearance):
 
 
 class ViewGrids(ViewAppearance):
-    """Hold and optimize a bilateral grid (12, l, y, x) of each training view.
+    """Hold and optimize a bilateral grid (y, x, l, 12) of each training view.
 
     At each brightness, the mean over all views and places is the identity: a tone curve that all photos share can be
-    the field's. A pattern over the image that they share, such as vignetting, cannot, and stays.
+    the field's. A pattern over the image that they share cannot, and stays.
     """
 
     WARM_UP: ClassVar[float] = 1 / 30  # 1,000 of 30,000 iterations, as in nerfstudio and gsplat
     EPSILON: ClassVar[float] = 1e-15  # a node has a small part of the loss's gradient
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        grids_in_triton(self.transforms)  # compiles its kernels now, not in the first iteration
 
     @staticmethod
     def uniform(colors: Tensor, size: tuple[int, int]) -> Tensor:
@@ -155,7 +167,7 @@ class ViewGrids(ViewAppearance):
         if not learned:
             path = archive.path(f"level_{level}", GRIDS)
             raise RunFolderError(f"{path} does not exist, and the next level continues from it; train with --overwrite")
-        _, *nodes = next(iter(learned.values())).shape
+        *nodes, _ = next(iter(learned.values())).shape
         (unchanged,) = uniform_grids(identities(1), (nodes[0], nodes[1], nodes[2]))
         return torch.stack([learned.get(name, unchanged) for name in names])
 
@@ -165,7 +177,7 @@ class ViewGrids(ViewAppearance):
 
     def archived(self) -> Exposures:
         """Return the mean colour transform of each grid by view: what is known of a photo's exposure as a whole."""
-        means = self.transforms.detach().mean(dim=(2, 3, 4)).view(-1, 3, 4)
+        means = self.transforms.detach().mean(dim=(1, 2, 3)).view(-1, 3, 4)
         return dict(zip(self.names, means.cpu().tolist(), strict=True))
 
     def archived_grids(self) -> Grids:
@@ -173,15 +185,14 @@ class ViewGrids(ViewAppearance):
         return dict(zip(self.names, self.transforms.detach().cpu().clone().unbind(), strict=True))
 
     def _step(self) -> None:
-        with torch.enable_grad():
-            # The mean over all grids in each of v iterations: the sum over them in a pass.
-            (VARIATION_WEIGHT * total_variation(self.transforms)).backward()  # type: ignore[no-untyped-call]  # torch's
+        assert self.transforms.grad is not None, "of the pass that ends here"
+        # The mean over all grids in each of v iterations: the sum over them in a pass.
+        add_variation(self.transforms.detach(), self.transforms.grad, VARIATION_WEIGHT)
         super()._step()
 
     def _recentre(self) -> None:
-        common = self.transforms.mean(dim=(0, 3, 4))  # (12, l)
-        unchanged = torch.eye(3, 4, device=common.device).view(12, 1)
-        self.transforms.sub_((common - unchanged)[:, :, None, None])
+        common = self.transforms.mean(dim=(0, 1, 2))  # (l, 12)
+        self.transforms.sub_(common - torch.eye(3, 4, device=common.device).flatten())
 
 
 KINDS: Mapping[str, type[ViewAppearance]] = {AFFINE: ViewColors, BILATERAL: ViewGrids}

@@ -10,6 +10,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
+from lapgs_plugin.ops.adam.multi_tensor import triton_works as adam_in_triton
+
 BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
 
@@ -61,6 +64,8 @@ class ViewTransforms(ABC):
     def __post_init__(self) -> None:
         self._index = {name: index for index, name in enumerate(self.names)}
         self._adam = torch.optim.Adam([self.transforms], lr=self._rates[0], betas=BETAS, eps=self.EPSILON)
+        if adam_in_triton(self.transforms):
+            fuse_steps(self._adam)
 
     @property
     @abstractmethod

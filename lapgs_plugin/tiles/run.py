@@ -242,6 +242,7 @@ def _adopt(archive: RunArchive, base: RunArchive, shared: GaussianField, kept: T
         shared: field of level `SHARED`.
         kept: (n,) bool, which of its Gaussians.
     """
+    archive.write_vignetting(base.vignetting())
     for level in base.available_levels:
         if level == SHARED:
             moments = base.optimizer_state(SHARED)

@@ -15,6 +15,7 @@ from lapgs_plugin.evaluation.metrics import color_fitted_psnr, psnr
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.ops.color_transform import transform_colors
 from lapgs_plugin.ops.composition import add_prediction
+from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.runs.neighbours import predicted_exposures
 from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.training.monitor import Monitor
@@ -132,8 +133,9 @@ class StageEvaluation:
         return ViewPsnr(psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask), without)
 
     def _beside_photo(self, view: View, image: Tensor, exposure: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return an image (3, h, w) of the level at full size with a photo's exposure, the photo and its mask."""
+        """Return an image (3, h, w) of the level at full size as a view is photographed, the photo and its mask."""
         whole, photo, mask = self.run.prepared.beside_photo(self.run.stage.level, image, view.image, view.mask)
+        whole = vignette(whole, [self.run.falloffs.get(view.name, 0.0)])
         return whole if exposure is None else transform_colors(whole, exposure.to(whole.device)), photo, mask
 
     def warn_of_a_fall(self, measured: Mapping[str, float]) -> None:

@@ -16,7 +16,9 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import FieldInTraining, HookDispatcher, StageContext
 from lapgs_plugin.ops.mixed_sizes import Sizes, if_mixed, own_part, own_parts
 from lapgs_plugin.ops.photometric_loss import photometric_loss
+from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.runs.profiling import Breakdown
+from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.stages.appearance import ViewAppearance
 from lapgs_plugin.stages.images import StageImages
 from lapgs_plugin.stages.joint import Predictions, RenderedPredictions
@@ -36,6 +38,7 @@ class ViewLosses:
         hooks: compose, and compute losses.
         rasterizer: renders more of the field for hooks that ask for it.
         appearance: transforms of the views' images; None with `--appearance none`.
+        falloffs: brightness of the corners of views, see `measure_vignetting`.
         ssim_weight: share of SSIM in a loss.
     """
 
@@ -45,6 +48,7 @@ class ViewLosses:
     hooks: HookDispatcher
     rasterizer: Rasterizer
     appearance: ViewAppearance | None
+    falloffs: Falloffs
     ssim_weight: float
 
     @cached_property
@@ -134,10 +138,12 @@ class ViewLosses:
         return self.hooks.takes_batches and not if_mixed([camera.size for camera in cameras])
 
     def as_photographed(self, names: Sequence[str], image: Tensor, sizes: Sizes | None = None) -> Tensor:
-        """Return the composed image of a view, or images of several, with the appearance of their photos.
+        """Return the composed image of a view, or images of several, with falloff and appearance of their photos.
 
         Args:
             names, image: of the views.
             sizes: of views whose sizes differ, see `mixed_sizes`.
         """
+        if self.falloffs:
+            image = vignette(image, [self.falloffs.get(name, 0.0) for name in names], sizes)
         return image if self.appearance is None else self.appearance.apply(names, image, sizes)

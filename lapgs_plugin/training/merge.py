@@ -17,6 +17,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.units import in_unit
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.jit.threads import one_pool
+from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
@@ -25,6 +26,7 @@ from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import Manifest
+from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.scenes.source import HOLD_OUT_EVERY
 from lapgs_plugin.training.backend import choose_rasterizer, training_rasterizer
@@ -105,7 +107,7 @@ def merge_levels(
             field = fitted.field(0)
         colors_fitted = archive.exposure(archive.available_levels[-1]) is not None
         placed = replace(placed, rasterizer=in_unit(placed.rasterizer, manifest.scene.unit))
-        return _measured(field, teacher, scene, placed, colors_fitted)
+        return _measured(field, teacher, scene, placed, colors_fitted, archive.vignetting())
 
 
 def first_field(fields: dict[int, GaussianField]) -> GaussianField:
@@ -168,8 +170,9 @@ def _composed(renderer: HierarchyRenderer, scene: Scene) -> Scene:
 
 @torch.no_grad()
 def _measured(
-    field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer, colors_fitted: bool
-) -> Merged:
+    field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer, colors_fitted: bool,
+    falloffs: Falloffs,
+) -> Merged:  # fmt: skip
     on_device, photos = field.to(placed.device), {view.name: view for view in scene.test}
     background = torch.tensor(scene.background, device=placed.device)
     to_photo = color_fitted_psnr if colors_fitted else psnr
@@ -178,7 +181,8 @@ def _measured(
         image = placed.rasterizer.render_image(on_device, view.camera, background=background).cpu()
         kept.append(psnr(image, view.image))
         if (photo := photos.get(view.name)) is not None:
-            run_and_field = (to_photo(shown, photo.image, photo.mask) for shown in (view.image, image))
+            both = (vignette(shown, [falloffs.get(view.name, 0.0)]) for shown in (view.image, image))
+            run_and_field = (to_photo(shown, photo.image, photo.mask) for shown in both)
             against_photos.append(tuple(run_and_field))
     means = tuple(map(fmean, zip(*against_photos, strict=True)))
     return Merged(field, fmean(kept), len(kept), (means[0], means[1]) if means else None, colors_fitted)

@@ -229,9 +229,9 @@ class TrainSettings(HierarchySettings):
     appearance: str = option(
         AUTO,
         "Learn how each training photo differs from the scene. affine: a colour transform, against changes of exposure "
-        "and white balance. bilateral: a grid of them over the image and brightness, also against vignetting and local "
-        "tone mapping. auto: affine if the photos' exposure is measured to differ, else none. Renders show the mean "
-        "exposure.",
+        "and white balance. bilateral: a grid of them over the image and brightness, also against local tone mapping. "
+        "auto: affine if the photos' exposure is measured to differ. All but none measure vignetting and compensate "
+        "it. Renders show the mean exposure.",
         panel=SCHEDULE,
         choices=(AUTO, NONE, *APPEARANCES),
     )

@@ -22,6 +22,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
 from lapgs_plugin.runs.image_store import AHEAD
+from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.stages.appearance import ViewAppearance
 from lapgs_plugin.stages.geometry import StageGeometry, depth_weight
 from lapgs_plugin.stages.images import StageImages
@@ -85,6 +86,7 @@ class StageRun:
         model: the field, edited in place.
         densifier: density control with its statistics.
         appearance: transforms of the training views' images; None with `--appearance none`.
+        falloffs: brightness of the corners of views, see `measure_vignetting`.
         poses: corrections of the training views' poses; None without refinement.
         geometry: supervises depth, normals and sky; None without.
         record: measures it.
@@ -107,6 +109,7 @@ class StageRun:
     model: TrainableField
     densifier: DensityControl
     appearance: ViewAppearance | None
+    falloffs: Falloffs
     poses: ViewPoses | None
     geometry: StageGeometry | None
     record: StageRecord
@@ -147,6 +150,7 @@ class StageRun:
             hooks=self.hooks,
             rasterizer=self._rasterizer,
             appearance=self.appearance,
+            falloffs=self.falloffs,
             ssim_weight=settings.ssim_weight,
         )
         self._scoring = FieldScoring(

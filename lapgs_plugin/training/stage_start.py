@@ -19,9 +19,11 @@ from lapgs_plugin.rendering.run import refined_views
 from lapgs_plugin.runs.image_store import eight_bit_levels
 from lapgs_plugin.runs.layout import OPTIMIZER
 from lapgs_plugin.runs.profiling import Overhead
+from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
-from lapgs_plugin.scenes.exposure import colors_at, measure_exposure
+from lapgs_plugin.scenes.exposure import SparseColors, colors_at, measure_exposure, sparse_colors
 from lapgs_plugin.scenes.scene import View, with_pixels
+from lapgs_plugin.scenes.vignetting import measure_vignetting
 from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, ViewColors, from_gains, identities
 from lapgs_plugin.stages.geometry import StageGeometry, at_level, depths_of, skies_of
 from lapgs_plugin.stages.images import StageImages
@@ -146,16 +148,19 @@ def _geometry(run: PreparedRun, stage: Stage, *, jointly: bool) -> StageGeometry
 
 def first_appearance(
     run: PreparedRun, stage: Stage, checkpoint: dict[str, Any] | None, overhead: Overhead, monitor: Monitor
-) -> ViewAppearance | None:
-    """Return the transforms of the training views' images that a stage starts with; None without."""
+) -> tuple[ViewAppearance | None, Falloffs]:
+    """Return the transforms of the training views' images that a stage starts with, and the falloffs of all views.
+
+    None without transforms.
+    """
     names, levels, choice = (
         [view.name for view in run.scene.train],
         run.archive.available_levels,
         run.settings.appearance,
     )
     if choice == NONE or not run.supervision.composes:
-        return None
-    kind = KINDS[AFFINE if choice == AUTO else choice]
+        return None, {}
+    kind, falloffs = KINDS[AFFINE if choice == AUTO else choice], run.archive.vignetting()
     size = largest_size([view.camera.size for view in run.scene.train])
     start: Tensor | None
     if levels:
@@ -164,27 +169,46 @@ def first_appearance(
         start = None if checkpoint.get("appearance") is None else kind.uniform(identities(len(names)), size)
     else:
         with overhead.timed("appearance"):
-            colors = _measured_colors(run, monitor)
+            seen = _sparse_colors(run)
+            falloffs = _measured_falloffs(run, seen, monitor)
+            colors = _measured_colors(run, seen, monitor)
         start = None if colors is None else kind.uniform(colors, size)
     if start is None:
-        return None
+        return None, falloffs
     done = run.plan.iterations_before(stage.level)
     appearance = kind.create(names, start, run.device, done, run.plan.iterations)
     if run.part_of_views and isinstance(appearance, ViewColors):  # the identity is the mean of all views
         appearance.centre = start.mean(dim=0).to(run.device)
-    return appearance
+    return appearance, falloffs
 
 
-def _measured_colors(run: PreparedRun, monitor: Monitor) -> Tensor | None:
-    """Return the photos' colour transforms (v, 3, 4) by their measured exposure; None if none are to be learned."""
-    choice = run.settings.appearance
+def _sparse_colors(run: PreparedRun) -> SparseColors | None:
+    """Look up sparse points in the photos of all ranks."""
 
     def look_up(points: Tensor) -> list[tuple[Tensor, Tensor]]:
         own = {view.name: colors_at(view, points) for view in run.owned(run.scene.train)}
         seen = {name: colors for one in run.ranks.gathered(own) for name, colors in one.items()}
         return [seen[view.name] for view in run.scene.train]
 
-    measured = measure_exposure(run.scene, look_up)
+    return sparse_colors(run.scene, look_up)
+
+
+def _measured_falloffs(run: PreparedRun, seen: SparseColors | None, monitor: Monitor) -> Falloffs:
+    """Measure how much the photos' corners are darker, and archive it."""
+    falloffs = measure_vignetting(run.scene, seen)
+    run.archive.write_vignetting(falloffs)
+    if falloffs:
+        most = -min(falloffs.values())
+        monitor.say(
+            f"the corners of photos are darker by {most:.2f} stops: levels are trained without that; --appearance none "
+            "trains them with it"
+        )
+    return falloffs
+
+
+def _measured_colors(run: PreparedRun, seen: SparseColors | None, monitor: Monitor) -> Tensor | None:
+    """Return the photos' colour transforms (v, 3, 4) by their measured exposure; None if none are to be learned."""
+    choice, measured = run.settings.appearance, measure_exposure(run.scene, seen)
     spread, differ = f"{measured.spread:.2f} stops between photos", measured.spread >= DIFFERENT
     if choice == AUTO and not differ:
         return None

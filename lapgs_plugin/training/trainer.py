@@ -324,6 +324,7 @@ class Trainer:
     ) -> StageRun:
         """Return a stage that is ready to train a model, or to be restored from a checkpoint."""
         prepared, poses = self.prepared, first_poses(self.prepared, stage)
+        appearance, falloffs = first_appearance(prepared, stage, checkpoint, record.overhead, self.monitor)
         if record.counts.iteration == 0:
             record.counts.start_gaussians = len(model)
         return StageRun(
@@ -334,7 +335,8 @@ class Trainer:
             hooks=self._hooks,
             model=model,
             densifier=prepared.density_control(stage, schedule),
-            appearance=first_appearance(prepared, stage, checkpoint, record.overhead, self.monitor),
+            appearance=appearance,
+            falloffs=falloffs,
             poses=poses,
             geometry=stage_geometry(prepared, stage),
             record=record,

@@ -54,6 +54,9 @@ class FollowedArchive(RunArchive):
     def rewind_history(self, level: int, iteration: int) -> None:
         pass
 
+    def write_vignetting(self, falloffs: Mapping[str, float]) -> None:
+        pass
+
     def save_checkpoint(self, state: dict[str, Any], extends_to: int | None = None) -> None:
         pass
 
