@@ -230,8 +230,8 @@ class TrainSettings(HierarchySettings):
         AUTO,
         "Learn how each training photo differs from the scene. affine: a colour transform, against changes of exposure "
         "and white balance. bilateral: a grid of them over the image and brightness, also against local tone mapping. "
-        "auto: affine if the photos' exposure is measured to differ. All but none measure vignetting and compensate "
-        "it. Renders show the mean exposure.",
+        "auto: affine if the photos' exposure is measured to differ, else none. Both kinds compensate measured "
+        "vignetting, too. Renders show the mean exposure.",
         panel=SCHEDULE,
         choices=(AUTO, NONE, *APPEARANCES),
     )

@@ -170,8 +170,9 @@ def first_appearance(
     else:
         with overhead.timed("appearance"):
             seen = _sparse_colors(run)
-            falloffs = _measured_falloffs(run, seen, monitor)
             colors = _measured_colors(run, seen, monitor)
+            # Where nothing else is compensated, the field stays one that photos can be compared with as they are.
+            falloffs = {} if colors is None else _measured_falloffs(run, seen, monitor)
         start = None if colors is None else kind.uniform(colors, size)
     if start is None:
         return None, falloffs
