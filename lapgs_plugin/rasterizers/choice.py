@@ -28,6 +28,9 @@ logger = logging.getLogger(__name__)
 RASTER_SETTINGS = "raster"
 """Key of a manifest's settings for the rasterizer settings that change images, such as {"mult": 0.5}."""
 
+RAYS = "rays"
+"""Argument by which rasterizers evaluate Gaussians along rays, as cameras with a lens need it."""
+
 OWN: dict[str, type[Rasterizer]] = {
     gsplat.NAME: gsplat.GsplatRasterizer,
     **CPU_RASTERIZERS,
@@ -83,7 +86,8 @@ def rasterizer_for(manifest: Manifest, device: str = "auto", rasterizer: str = "
 def _raster_settings(manifest: Manifest) -> dict[str, Any]:
     """Return the run's rasterizer settings that differ from the defaults."""
     recorded = manifest.settings.get(RASTER_SETTINGS, {})
-    return {name: value for name, value in recorded.items() if value != CONSTANTS.get(name)}
+    along_rays = {RAYS: True} if manifest.scene.distorted else {}
+    return along_rays | {name: value for name, value in recorded.items() if value != CONSTANTS.get(name)}
 
 
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
@@ -98,7 +102,7 @@ def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tup
         where = "on the CPU" if device == "cpu" else "without a CUDA device"
         failed = "" if trained in OWN or not obstacle else f", because {obstacle}"
         return _named("cpu", "cpu", settings), f"the fastest {where}{failed}"
-    reason = gsplat.missing()
+    reason = gsplat.missing(direct=RAYS not in settings)
     if not reason:
         return _named(gsplat.NAME, "cuda", settings), obstacle
     if device == "cuda":
@@ -132,9 +136,10 @@ def placed_rasterizer(name: str, device: str = "auto", settings: Mapping[str, An
     label = f"--rasterizer {name}" if name in OWN else f"--rasterizer {name}: {kind.__module__}.{kind.__qualname__}"
     try:
         known, unsupported = _split(settings or {}, inspect.signature(kind).parameters)
+        _require_rays(label, unsupported)
         rasterizer = kind(**known)
     except Exception as error:
-        if name in OWN:
+        if name in OWN or isinstance(error, LapgsError):
             raise
         # Whatever a package's code does wrong, the user must learn which package it was.
         raise UserInputError(
@@ -164,8 +169,19 @@ def _extension(name: str, stand_in: str, device: str, settings: Mapping[str, Any
     else:
         where, module = "cuda", import_extension(name)
     known, unsupported = _split(settings, constants_of(module))
+    _require_rays(f"--rasterizer {name}", unsupported)
     extension = CudaExtension(name, where, settings=known, module=module)
     return PlacedRasterizer(SignedColorRasterizer(extension), torch.device(where), unsupported)
+
+
+def _require_rays(label: str, unsupported: Container[str]) -> None:
+    """Raise a UserInputError if a rasterizer, named by a label, does not have the setting for cameras with a lens."""
+    if RAYS in unsupported:
+        others = [name for name, kind in OWN.items() if RAYS in inspect.signature(kind).parameters]
+        raise UserInputError(
+            f"{label} renders pinholes alone, and a run with --distorted is rendered along rays; choose "
+            f"{' or '.join(others)}"
+        )
 
 
 def _split(settings: Mapping[str, Any], known: Container[str]) -> tuple[dict[str, Any], dict[str, Any]]:

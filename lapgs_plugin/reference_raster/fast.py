@@ -18,6 +18,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_e
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.reference_raster import pipeline
 from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
+from lapgs_plugin.reference_raster.rays import render_along_rays
 
 
 class CpuRasterizer(Rasterizer):
@@ -28,10 +29,16 @@ class CpuRasterizer(Rasterizer):
     The first call on a machine compiles.
 
     Gaussians whose position or covariance on the image is not finite are culled: they get radius 0 and no gradient.
+
+    Args:
+        rays: evaluate Gaussians along rays, which a lens may bend; see `reference_raster.rays`. That is slow.
     """
 
     name = "cpu"
     devices = ("cpu",)
+
+    def __init__(self, *, rays: bool = False) -> None:
+        self._rays = rays
 
     def __call__(
         self, field: GaussianField, camera: Camera, *, background: Tensor, sh_degree: int | None = None
@@ -50,6 +57,8 @@ class CpuRasterizer(Rasterizer):
         """
         degree = degree_to_evaluate(field, sh_degree)
         _check(field, background)
+        if self._rays:
+            return render_along_rays(field, camera, background, degree)
         kind = field.means.dtype
         view = _view(camera, kind)
         background = background.to(kind)
@@ -73,6 +82,8 @@ class CpuRasterizer(Rasterizer):
         Raises:
             UserInputError: as `__call__`.
         """
+        if self._rays:
+            return super().render_images(field, cameras, background=background)
         _check(field, background)
         kind = field.means.dtype
         gaussians = _gaussians(list(field.parameters.values()), field.signed, field.sh_degree)

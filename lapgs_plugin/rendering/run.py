@@ -56,6 +56,7 @@ def load_reference(
         masks=reference.masks,
         sky=reference.sky,
         background=reference.background,
+        distorted=reference.distorted,
         check=check,
         hold=hold,
         read=read,
@@ -116,7 +117,13 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     """
     reference, path = _scene_folder(archive, moved_to)
     with _errors_about_scene(archive, moved_to):
-        train, test = load_cameras(path, resolution=reference.resolution, images=reference.images, eval=reference.eval)
+        train, test = load_cameras(
+            path,
+            resolution=reference.resolution,
+            images=reference.images,
+            eval=reference.eval,
+            distorted=reference.distorted,
+        )
     require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
     train, test = _as_trained(archive, train, test)
     return refined(archive, train), refined(archive, test)

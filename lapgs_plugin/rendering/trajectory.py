@@ -190,5 +190,5 @@ def _passing_times(positions: NDArray[np.float64], rotations: NDArray[np.float64
 
 
 def _median_lens(cameras: Sequence[Camera]) -> Camera:
-    """Return the camera with the median field of view; its pose is not used."""
-    return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2]
+    """Return the camera with the median field of view as a pinhole; its pose is not used."""
+    return sorted(cameras, key=lambda camera: camera.tan_half_fov[1])[len(cameras) // 2].straight()

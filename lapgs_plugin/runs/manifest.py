@@ -72,6 +72,7 @@ class SceneReference:
         masks: "none", "alpha", or the folder of masks, relative to the scene or absolute.
         unit: the length in the scene's units that is 1 for the rasterizer, see `scenes.Scene`.
         sky: "none", or the folder of masks of the sky.
+        distorted: whether cameras have their lenses, and Gaussians are evaluated along rays.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -85,6 +86,7 @@ class SceneReference:
     masks: PathText = "none"
     unit: Annotated[float, Field(gt=1e-30, lt=1e30)] = 1.0
     sky: PathText = "none"
+    distorted: bool = False
 
     @classmethod
     def of(

@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -25,6 +26,7 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.aligned_points import aligned_points
 from lapgs_plugin.scenes.images import find_image, image_size, where_else
+from lapgs_plugin.scenes.lenses import lens_of
 from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
 from lapgs_plugin.scenes.random_points import CAPTURE_RADIUS, OBJECT_RADIUS, random_points
 from lapgs_plugin.scenes.source import (
@@ -66,6 +68,10 @@ CAMERA_MODELS = {name.replace("_", ""): name for name in (*PINHOLE_MODELS, FISHE
     "RADIALFISHEYE": FISHEYE,
 }
 """COLMAP's camera models by the letters and digits of the names that programs write."""
+OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3")
+"""Distortion of perspective lenses in transforms files. Their k4 is nerfstudio's, not OpenCV's."""
+FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
+"""Distortion of fisheye lenses in transforms files."""
 POINT_FILES = ("points3d.ply", "points3D.ply")
 
 Values = dict[str, Any]
@@ -78,7 +84,9 @@ def has_transforms(path: Path) -> bool:
     return is_file(path / TRAIN_FILE) or is_file(path / SINGLE_FILE)
 
 
-def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | None = None) -> SceneSource:
+def read_transforms(
+    path: Path, images: str, evaluate: bool, lenses: Lenses | None = None, distorted: bool = False
+) -> SceneSource:
     """Read the frames and points of a transforms layout.
 
     With `evaluate`, a pair of files holds out the views of `transforms_test.json`, else `transforms_val.json`. A single
@@ -92,11 +100,14 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
         path: the scene folder.
         images: folder of the images, replacing the one in `file_path`; "images" keeps it if it is there.
         evaluate: hold out views.
-        lenses: filled with the lenses of the frames, whose cameras may then be distorted. None refuses distorted ones.
+        lenses: filled with the lenses of the frames, whose cameras may then be distorted. None refuses distorted ones,
+            unless `distorted`.
+        distorted: give cameras their lenses.
 
     Raises:
         SceneError: a file is unreadable or lacks something, a camera is distorted, or a pose is not rigid.
     """
+    lenses = {} if distorted and lenses is None else lenses
     single = not is_file(path / TRAIN_FILE)
     file = path / (SINGLE_FILE if single else TRAIN_FILE)
     values, warnings = _read_json(file), list[str]()
@@ -115,7 +126,46 @@ def read_transforms(path: Path, images: str, evaluate: bool, lenses: Lenses | No
         points, colors = cloud.xyz, cloud.rgb
     else:
         points, colors = random_points(frames, CAPTURE_RADIUS if single else OBJECT_RADIUS)
-    return SceneSource("transforms", *parted, points, colors, tuple(warnings))
+    train_frames, test_frames = (_with_lenses(part, lenses, path) if distorted else part for part in parted)
+    return SceneSource("transforms", train_frames, test_frames, points, colors, tuple(warnings))
+
+
+def _with_lenses(frames: Sequence[Frame], lenses: Lenses | None, path: Path) -> tuple[Frame, ...]:
+    """Return frames with their lenses."""
+    assert lenses is not None
+    changed = []
+    for frame in frames:
+        subject = f"{path}: the camera of {frame.name}"
+        kind, distortion = lenses[frame.path]
+        model, terms = colmap_distortion(subject, kind, distortion, "trained on as it is")
+        changed.append(replace(frame, camera=replace(frame.camera, lens=lens_of(model, terms, subject, path))))
+    return tuple(changed)
+
+
+def colmap_distortion(subject: str, kind: str, distortion: Mapping[str, object], use: str) -> tuple[str, list[float]]:
+    """Return COLMAP's camera model for a lens of a transforms file, and its distortion.
+
+    Args:
+        subject: begins the message.
+        kind, distortion: as `Lenses` has them.
+        use: what the lens is needed for, such as "undistorted".
+
+    Raises:
+        SceneError: COLMAP has none.
+    """
+    if kind in PINHOLE_MODELS and not distortion:
+        return "PINHOLE", []
+    if kind == ALL_AROUND:
+        return kind, []
+    model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
+    values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
+    if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):
+        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
+        raise SceneError(
+            f"{subject} in the transforms file ({kind}{terms}) cannot be {use}; expected numbers "
+            f"{', '.join(OPENCV_TERMS)}, or {', '.join(FISHEYE_TERMS)} of {FISHEYE}"
+        )
+    return model, values if kind == FISHEYE else [*values, 0.0, 0.0, 0.0]
 
 
 def count_frames(path: Path) -> int | None:

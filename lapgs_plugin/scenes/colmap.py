@@ -20,6 +20,7 @@ from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.colmap_model import MODEL_FILES, Model, count_images, points_files, read_model
 from lapgs_plugin.scenes.colmap_records import PosedImage
 from lapgs_plugin.scenes.images import find_image, where_else
+from lapgs_plugin.scenes.lenses import lens_of
 from lapgs_plugin.scenes.point_cloud import read_point_cloud
 from lapgs_plugin.scenes.random_points import random_points
 from lapgs_plugin.scenes.source import (
@@ -58,7 +59,7 @@ def largest_model(path: Path, model: Path) -> Path:
     return max([model, *others], key=count_images) if others else model
 
 
-def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSource:
+def read_colmap(path: Path, model: Path, images: str, evaluate: bool, distorted: bool = False) -> SceneSource:
     """Read the frames and points of a COLMAP scene.
 
     Args:
@@ -66,19 +67,38 @@ def read_colmap(path: Path, model: Path, images: str, evaluate: bool) -> SceneSo
         model: folder of the sparse model, from `find_model`.
         images: name of the image folder in the scene: "images", or smaller copies such as "images_4".
         evaluate: hold out every eighth image.
+        distorted: give cameras their lenses, instead of refusing distorted ones.
 
     Raises:
         SceneError: the model is incomplete, unreadable, empty or distorted, or the image folder is missing.
     """
     sparse = read_model(model)
-    refuse_distorted(sparse, path)
+    if not distorted:
+        refuse_distorted(sparse, path)
     folder = path / images
-    source = source_of(with_bare_names(sparse, folder), folder)
+    named = with_bare_names(sparse, folder)
+    source = source_of(named, folder)
+    source = with_lenses(source, named, path) if distorted else source
     if not is_folder(folder):
         first = next((frame.name for frame in source.train), "")
         raise SceneError(f"{folder}: no such folder of images; {where_else(path, first)}")
     train, test = hold_out(source.train, evaluate)
     return replace(source, train=train, test=test, warnings=source.warnings + larger_model(path, model))
+
+
+def with_lenses(source: SceneSource, model: Model, path: Path) -> SceneSource:
+    """Return the training frames of a model with their lenses.
+
+    Raises:
+        SceneError: one cannot be trained on as it is; the advice is about the scene folder `path`.
+    """
+    lenses = {
+        camera.camera_id: lens_of(camera.model.name, _extra(camera), f"{model.folder}: camera {camera.camera_id}", path)
+        for camera in _used_cameras(model)
+    }
+    by_name = {image.name: lenses[image.camera_id] for image in model.images.values()}
+    frames = [replace(frame, camera=replace(frame.camera, lens=by_name[frame.name])) for frame in source.train]
+    return replace(source, train=tuple(frames))
 
 
 def refuse_distorted(model: Model, path: Path) -> None:
@@ -187,10 +207,15 @@ def _used_cameras(model: Model) -> list[pycolmap.Camera]:
     return [model.cameras[key] for key in sorted({image.camera_id for image in model.images.values()})]
 
 
+def _extra(camera: pycolmap.Camera) -> list[float]:
+    """Return the parameters besides focal lengths and principal point."""
+    return [float(camera.params[index]) for index in camera.extra_params_idxs()]
+
+
 def _distortion(camera: pycolmap.Camera) -> str:
     """Return the model of a distorted camera and its parameters, or ""."""
     kind = camera.model.name
-    distortion = [float(camera.params[index]) for index in camera.extra_params_idxs()]
+    distortion = _extra(camera)
     if kind in PINHOLE_MODELS and not any(distortion):
         return ""
     return kind + (f" with parameters {', '.join(f'{value:g}' for value in distortion)}" if distortion else "")

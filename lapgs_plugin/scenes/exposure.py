@@ -139,7 +139,7 @@ def colors_at(view: View, points: Tensor) -> tuple[Tensor, Tensor]:
 def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Project points: x and y (n,) in image widths and heights, and which are visible (n,)."""
     x, y, depth = place_in_image(camera, points)
-    inside = (depth > 0) & (x > 0) & (x < 1) & (y > 0) & (y < 1)
+    inside = camera.shown(camera.local(points))[1]
     cell = torch.where(inside, (CELLS * y).floor() * CELLS + (CELLS * x).floor(), 0.0).long()
     nearest = torch.full((CELLS * CELLS,), math.inf).scatter_reduce(0, cell[inside], depth[inside], "amin")
     return x, y, inside & (depth <= nearest[cell] * DEPTH_MARGIN)
@@ -147,10 +147,9 @@ def _visible(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def place_in_image(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Project points: x and y (n,) in image widths and heights, and their depths (n,)."""
-    x, y, depth = camera.local(points).unbind(-1)
-    x = (camera.fx * x / depth + camera.cx) / camera.width
-    y = (camera.fy * y / depth + camera.cy) / camera.height
-    return x, y, depth
+    local = camera.local(points)
+    pixels, _ = camera.projected(local)
+    return pixels[:, 0] / camera.width, pixels[:, 1] / camera.height, local[:, 2]
 
 
 def agreement(values: Tensor, usable: Tensor) -> Tensor:

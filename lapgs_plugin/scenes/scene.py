@@ -183,6 +183,7 @@ def load_scene(
     masks: str = AUTO,
     sky: str = NONE,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    distorted: bool = False,
     progress: bool | ProgressCallback = True,
     check: Callable[[tuple[int, int], int], None] | None = None,
     hold: bool = True,
@@ -202,6 +203,8 @@ def load_scene(
         masks: as `masks.resolve_masks` takes it.
         sky: as `masks.resolve_sky` takes it.
         background: RGB behind transparent pixels.
+        distorted: give cameras the lenses that bend their rays, instead of refusing distorted ones. Pixels to which a
+            lens shows nothing are masked.
         progress: True shows a bar on stderr, False nothing. A function is called with the number of images read and
             their total.
         check: called before any image is read, with `Scene.smallest_size` and the number of training views. An error
@@ -217,7 +220,7 @@ def load_scene(
     rule = parse_resolution(resolution)
     path = Path(path)
     masks, sky = resolve_masks(path, masks), resolve_sky(path, sky)
-    source = _checked_source(path, images, eval)
+    source = _checked_source(path, images, eval, distorted)
     require_places(torch.from_numpy(source.points), f"{path}:")
     for warning in source.warnings:
         logger.warning(warning)
@@ -259,10 +262,12 @@ def load_scene(
                 own: Tensor | None = read_mask(mask_files[frame.name], image_size(frame.path), size)
             else:
                 own = alpha_mask(frame.path, size) if masks == ALPHA else None
+            if (lit := lit_pixels(camera)) is not None:
+                own = lit if own is None else own & lit
             return own if (above := in_sky()) is None else outside_sky(own, above, sky_files[frame.name])
 
         if not read:
-            masked = bool(mask_files) or masks == ALPHA or frame.name in sky_files
+            masked = bool(mask_files) or masks == ALPHA or frame.name in sky_files or lit_pixels(camera) is not None
             return View(
                 frame.name, camera, image, mask if masked else None, in_sky if frame.name in sky_files else None
             )
@@ -293,6 +298,14 @@ def load_scene(
     )
 
 
+def lit_pixels(camera: Camera) -> Tensor | None:
+    """Return the pixels (1, h, w) to which a camera's lens shows something; None if it does to all."""
+    if camera.lens is None:
+        return None
+    lit = camera.pixel_rays()[1]
+    return None if bool(lit.all()) else lit[None]
+
+
 def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = True) -> list[View]:
     """Return views whose images are in memory; `progress` as `load_scene` takes it.
 
@@ -308,18 +321,23 @@ def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = Tru
 
 
 def load_cameras(
-    path: Path | str, *, resolution: str = "full", images: str = "images", eval: bool = False
+    path: Path | str,
+    *,
+    resolution: str = "full",
+    images: str = "images",
+    eval: bool = False,
+    distorted: bool = False,
 ) -> tuple[dict[str, Camera], dict[str, Camera]]:
     """Return the cameras of `Scene.train` and `Scene.test` by view name, without reading images.
 
     Args:
-        path, resolution, images, eval: as `load_scene` takes them.
+        path, resolution, images, eval, distorted: as `load_scene` takes them.
 
     Raises:
         SceneError, UserInputError: as `load_scene`.
     """
     rule = parse_resolution(resolution)
-    source = _checked_source(Path(path), images, eval)
+    source = _checked_source(Path(path), images, eval, distorted)
     train, test = ({f.name: _sized_camera(f, rule) for f in frames} for frames in (source.train, source.test))
     return train, test
 
@@ -343,8 +361,8 @@ def smallest_of(cameras: Iterable[Camera]) -> tuple[int, int]:
     return min(widths), min(heights)
 
 
-def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
-    """Return the frames and points of a scene folder, after checks."""
+def _checked_source(path: Path, images: str, evaluate: bool, distorted: bool) -> SceneSource:
+    """Return the frames and points of a scene folder, after checks; arguments as `load_scene` takes them."""
     try:
         str(path.absolute()).encode()
     except UnicodeEncodeError as error:
@@ -355,22 +373,26 @@ def _checked_source(path: Path, images: str, evaluate: bool) -> SceneSource:
             "photos or a video with `lapgs prepare PHOTOS OUT`"
         )
     if (model := find_model(path)) is not None:
-        source = read_colmap(path, model, images, evaluate)
+        source = read_colmap(path, model, images, evaluate, distorted)
         if (count := count_frames(path)) not in (None, total := len(source.train) + len(source.test)):
             line = (
                 f"{path / SINGLE_FILE} lists {counted(count, 'photo')} and {model} {total}, which are used, as in 3DGS"
             )
             source = replace(source, warnings=(*source.warnings, line))
     elif has_transforms(path):
-        source = read_transforms(path, images, evaluate)
+        source = read_transforms(path, images, evaluate, distorted=distorted)
     elif (export := find_export(path)) is not None:
-        source = read_export(export, path, images, evaluate)
+        source = read_export(export, path, images, evaluate, distorted)
     else:
         raise SceneError(
             f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json, nor an export of another "
             f"program in it; {_advice_about(path)}"
         )
     check_source(path, source)
+    if distorted and all(frame.camera.lens is None for frame in (*source.train, *source.test)):
+        raise SceneError(
+            f"{path}: no camera of it is distorted, so that --distorted would only make training slower; leave it out"
+        )
     return source
 
 
@@ -508,10 +530,8 @@ def _median_depth(points: NDArray[np.float64], train: Sequence[Frame]) -> float:
 
 def _depths_in_view(camera: Camera, points: Tensor) -> Tensor:
     """Return the depths of those points (n, 3) that a camera sees, were none hidden."""
-    x, y, depths = camera.local(points).unbind(-1)
-    across, down = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy
-    inside = (across > 0) & (across < camera.width) & (down > 0) & (down < camera.height)
-    return depths[(depths > 0) & inside]
+    local = camera.local(points)
+    return local[camera.shown(local)[1], 2]
 
 
 def require_places(points: Tensor, whose: str) -> None:

@@ -71,7 +71,10 @@ def undistort_hint(scene: Path, model: str) -> str:
     """Return advice about a scene's distorted cameras of this camera model."""
     if model == ALL_AROUND:
         return f"it sees all around; cut its photos into pinhole images with `lapgs prepare {quote(str(scene))} OUT`"
-    return f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`"
+    return (
+        f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`, or see "
+        "--distorted of `lapgs train`"
+    )
 
 
 def check_camera(subject: str, camera: Camera) -> None:

@@ -107,6 +107,8 @@ def require_tileable(settings: TrainSettings) -> None:
         raise UserInputError(f"--time {settings.time} with --tiles: is the length of one run; give --iterations")
     if settings.stops_early:
         raise UserInputError("--stop auto with --tiles: a tile sees parts of its views; give --iterations alone")
+    if settings.distorted:
+        raise UserInputError("--distorted with --tiles: what views see of a tile is that of pinholes; leave one out")
     if settings.refine_poses:
         raise UserInputError("--refine-poses with --tiles: tiles would move the same cameras apart; leave one out")
     if settings.appearance == BILATERAL:

@@ -7,7 +7,7 @@ import torch
 from lapgs_plugin.environment import driver_version, gpus_are_hidden
 from lapgs_plugin.errors import MissingExtraError, UserInputError
 from lapgs_plugin.hierarchy.settings import AUTO
-from lapgs_plugin.rasterizers.choice import RASTERIZERS, PlacedRasterizer, placed_rasterizer
+from lapgs_plugin.rasterizers.choice import RASTERIZERS, RAYS, PlacedRasterizer, placed_rasterizer
 from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.training.settings import TrainSettings
 
@@ -67,9 +67,10 @@ def training_rasterizer(name: str, settings: TrainSettings) -> PlacedRasterizer:
             packed=settings.packed,
             absgrad=settings.densification.options.needs_absgrad,
             own_radii=True,
+            rays=settings.distorted,
         )
         return PlacedRasterizer(rasterizer, torch.device("cuda"), {})
-    placed = placed_rasterizer(name)
+    placed = placed_rasterizer(name, settings={RAYS: True} if settings.distorted else None)
     asked = {
         "--antialiased": settings.antialiased,
         "--packed": settings.packed,

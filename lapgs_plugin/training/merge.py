@@ -92,7 +92,7 @@ def merge_levels(
         start = first_field(fields)
         name = choose_rasterizer(AUTO)
         settings = _settings(manifest, start.sh_degree, iterations, on_gsplat=name == gsplat.NAME)
-        reference = replace(manifest.scene, eval=True)
+        reference = replace(manifest.scene, eval=True, distorted=False)  # other programs render pinholes
         placed = training_rasterizer(name, settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
         with RunArchive.create(Path(scratch) / "run", empty) as fitted:
@@ -152,7 +152,7 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int, on_gsplat: bo
 
 
 def _composed(renderer: HierarchyRenderer, scene: Scene) -> Scene:
-    """Return the scene with the run's images; some training views are held out if none were."""
+    """Return the scene with the run's images of pinholes; some training views are held out if none were."""
     train, test = list(scene.train), list(scene.test)
     if not test:
         test = train[::HOLD_OUT_EVERY]
@@ -161,7 +161,7 @@ def _composed(renderer: HierarchyRenderer, scene: Scene) -> Scene:
     def rendered(views: Sequence[View], title: str) -> tuple[View, ...]:
         with item_progress("views") as bar, torch.no_grad():
             return tuple(
-                replace(view, image=renderer.images([view.camera], 0)[0].clamp(0, 1).cpu(), mask=None)
+                View(view.name, camera := view.camera.straight(), renderer.images([camera], 0)[0].clamp(0, 1).cpu())
                 for view in bar.track(views, description=title)
             )
 
@@ -173,7 +173,8 @@ def _measured(
     field: GaussianField, teacher: Scene, scene: Scene, placed: PlacedRasterizer, colors_fitted: bool,
     falloffs: Falloffs,
 ) -> Merged:  # fmt: skip
-    on_device, photos = field.to(placed.device), {view.name: view for view in scene.test}
+    on_device = field.to(placed.device)
+    photos = {view.name: view for view in scene.test if view.camera.lens is None}  # of others there are no pinholes
     background = torch.tensor(scene.background, device=placed.device)
     to_photo = color_fitted_psnr if colors_fitted else psnr
     kept, against_photos = [], []

@@ -136,6 +136,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
         images=photos.images,
         masks=masks,
         sky=resolve_sky(Path(request.scene), photos.sky),
+        distorted=settings.distorted,
     )
     if request.control.log is not None:
         require_tensorboard()
@@ -386,10 +387,27 @@ def _say_about_photos(run: PreparedRun, say: Say) -> None:
     if any(view.masked for view in views):
         share, _ = mean(share_inside([view.mask]) for view in own)
         masks = scene.masks if scene.sky == NONE else "and sky"
+        masks = "of lenses" if masks == NONE else masks
         say(f"masks ({masks}): {share:.0%} of the pixels are trained on and measured")
+    if scene.distorted:
+        say(_about_lenses(run))
     size = run.plan[0].image_size
     if run.device.type == "cpu" and (hint := long_on_a_cpu(size, run.settings.iterations)):
         say(hint)
+
+
+def _about_lenses(run: PreparedRun) -> str:
+    """Return a line about what training on distorted photos costs."""
+    views = (*run.scene.train, *run.aside, *run.scene.test)
+    lenses = [view.camera.lens for view in views]
+    fisheyes = sum(lens is not None and lens.fisheye for lens in lenses)
+    others = sum(lens is not None for lens in lenses) - fisheyes
+    by = "gsplat's unscented transform" if run.device.type == "cuda" else "a reference that is for small images"
+    return (
+        f"--distorted: {fisheyes} photos of fisheye and {others} of perspective lenses are trained on as they are. "
+        f"Gaussians are evaluated along the rays of pixels by {by}, view by view, several times slower than pinholes; "
+        "nothing is shown at 90 degrees from the axis and more"
+    )
 
 
 def _require_same_folder(out: Path, before: Path, scene: Path) -> None:

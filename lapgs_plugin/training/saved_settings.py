@@ -37,6 +37,7 @@ def settings_from_manifest(manifest: Manifest, name: str = "the run's manifest")
     advice = "restore it or train again with --overwrite"
     values = {**manifest.settings, **{field: getattr(manifest, field) for field in IN_MANIFEST}}
     values.pop("raster", None)  # `antialiased` says it
+    values["distorted"] = manifest.scene.distorted
     if difference := sorted(set(values) ^ {f.name for f in fields(TrainSettings)}):
         raise RunFolderError(
             f"{name}: the run was not started by `lapgs train` of this version (settings {', '.join(difference)} "

@@ -254,6 +254,12 @@ class TrainSettings(HierarchySettings):
         "one by one, which takes longer on a GPU.",
         panel=SCHEDULE,
     )
+    distorted: bool = option(
+        False,
+        "Train on the photos of fisheye and distorted lenses as they are, instead of undistorting them, by gsplat's "
+        "unscented transform, or on a CPU by a slow reference. Only with --strategy mcmc.",
+        panel=SCHEDULE,
+    )
     keep: str = option(
         LAST,
         "State of each level to archive: last, or best as measured on a few training views, which are then not trained "
@@ -286,6 +292,7 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"sh_every {self.sh_every}: expected at least 1")
         self._check_base()
         self._check_unused()
+        self._check_distorted()
         require_composed(self.appearance, self.supervision)
         _ = self.asked_views
         if self.sh_rate_factor is not None:
@@ -327,7 +334,10 @@ class TrainSettings(HierarchySettings):
         density, paper = self.densification, self.protocol == "paper"
         if isinstance(density.options, Auto):
             heuristics = ["--protocol paper"] if paper else self._idle(STRATEGIES[MCMC])
-            name = density.options.choose(self.scheduled, heuristics)
+            length = (
+                max(self.scheduled, LONG_RUN) if self.distorted else self.scheduled
+            )  # along rays there is MCMC alone
+            name = density.options.choose(length, heuristics)
             chosen = replace(density, strategy=name, options=density.options.options_for(name))
             object.__setattr__(self, "densification", chosen)  # the dataclass is frozen
         elif paper and density.strategy != GRADIENTS:
@@ -357,6 +367,27 @@ class TrainSettings(HierarchySettings):
                 f"--base-sh-degree {degree} with --inherit full: a level that inherits all coefficients has as "
                 "many; inherit geometry or xyz"
             )
+
+    def _check_distorted(self) -> None:
+        """Refuse settings that need pinholes or projected centres, or are not tried along rays."""
+        if not self.distorted:
+            return
+        reasons = {
+            "--protocol paper": (self.protocol == "paper", "the paper has no lenses, and adds Gaussians by gradients"),
+            f"--strategy {self.densification.strategy} or an option of it": (
+                self.densification.strategy != MCMC,
+                "along rays only mcmc is tried; others have thresholds for gradients by projected centres",
+            ),
+            "--antialiased": (self.antialiased, "Gaussians are evaluated along rays, without a blur"),
+            "--packed": (self.packed, "gsplat does not pack what it evaluates along rays"),
+            "--sparse-adam": (self.sparse_adam, "it is not tried along rays"),
+            f"--depth {self.depth}": (self.depth != NONE, "maps and points are those of pinholes"),
+            f"--normals {self.normals}": (self.normals != NONE, "they are those of pinholes"),
+            "--refine-poses": (self.refine_poses, "it is not tried along rays"),
+        }
+        for other, (chosen, reason) in reasons.items():
+            if chosen:
+                raise UserInputError(f"--distorted with {other}: {reason}; leave one out")
 
     def _check_unused(self) -> None:
         """Refuse settings that have no effect with the strategy."""
@@ -526,6 +557,7 @@ class TrainSettings(HierarchySettings):
         """Return the settings as arguments of `Manifest`: its own fields by name, the others in "settings"."""
         # What rendering the run needs to know of the rasterizer, as `rasterizers.choice` reads it.
         values = {**self.resolved(), "raster": {"antialiasing": True} if self.antialiased else {}}
+        del values["distorted"]  # the manifest's scene says it
         return {**{name: values.pop(name) for name in IN_MANIFEST}, "settings": values}
 
 

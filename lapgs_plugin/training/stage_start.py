@@ -59,7 +59,9 @@ def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
 def _field_of_points(run: PreparedRun, stage: Stage) -> GaussianField:
     scene, settings = run.scene, run.settings
     points = field_from_points(scene.points, scene.colors, settings.sh_degree_of(stage.level))
-    return settings.densification.options.start(points, len(scene.train))
+    # Along rays nothing blurs Gaussians, and tiny ones, as many photos start with, would be between most rays.
+    photos = 0 if settings.distorted else len(scene.train)
+    return settings.densification.options.start(points, photos)
 
 
 def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, Any]:

@@ -11,7 +11,9 @@ Gaussians.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
+from importlib.metadata import version
 
 import torch
 from torch import Tensor
@@ -85,6 +87,15 @@ def gsplat_missing() -> str:
     return "" if built or CUDA_HOME else "gsplat's CUDA part is not built, and there is no nvcc to build it"
 
 
+def rays_missing() -> str:
+    """Return why the gsplat that is installed does not render along rays, as a clause; empty if it does."""
+    from gsplat import rasterization
+
+    if "with_ut" in inspect.signature(rasterization).parameters:
+        return ""
+    return f"gsplat {version('gsplat')} has no unscented transform, which came with 1.5"
+
+
 class GsplatRasterizer(Rasterizer):
     """Render float32 fields on a CUDA device with gsplat and the conventions of the 3DGS family.
 
@@ -98,7 +109,9 @@ class GsplatRasterizer(Rasterizer):
         own_radii: return gsplat's radii, which bound where alpha reaches 1/255, instead of computing those of three
             sigma; training only asks which are above 0.
         direct: render by our own kernels (`gsplat.direct`), in a fraction of the time. None does so if they are
-            validated on this machine. Not available with `packed` or `antialiasing`.
+            validated on this machine. Not available with `packed`, `antialiasing` or `rays`.
+        rays: evaluate Gaussians along rays, which a lens may bend, by gsplat's unscented transform; see
+            `reference_raster.rays`. Cameras are rendered one by one, and gradients by centres are lengths alone.
 
     Raises:
         MissingExtraError: neither our kernels nor gsplat's can render on this machine. A call raises it, too, if ours
@@ -118,13 +131,16 @@ class GsplatRasterizer(Rasterizer):
         absgrad: bool = True,
         own_radii: bool = False,
         direct: bool | None = None,
+        rays: bool = False,
     ) -> None:
         self._device = torch.device(device)
-        may_be_direct = not (packed or antialiasing) and direct is not False
-        if self._device.type == "cuda" and (reason := missing(direct=may_be_direct)):
+        may_be_direct = not (packed or antialiasing or rays) and direct is not False
+        if self._device.type == "cuda" and (reason := missing(direct=may_be_direct) or (rays and rays_missing())):
             why = "--packed and --antialiased need gsplat's CUDA part: " if packed or antialiasing else ""
+            why = "--distorted needs gsplat's CUDA part: " if rays else why
             raise MissingExtraError(f"--rasterizer {NAME}: {why}{reason}; `lapgs doctor` says what to install")
-        self._stock = StockRasterization(antialiasing, packed, own_radii)
+        self._rays = rays
+        self._stock = StockRasterization(antialiasing, packed, own_radii, rays)
         self._absgrad = absgrad
         self._may_be_direct = self._device.type == "cuda" and may_be_direct
         self._must_be_direct = bool(direct)
@@ -158,7 +174,7 @@ class GsplatRasterizer(Rasterizer):
     @property
     def can_batch(self) -> bool:
         """See `fields.rasterizer.Rasterizer`. Packed results have no row for each camera and Gaussian."""
-        return self._device.type == "cuda" and not self._stock.packed
+        return self._device.type == "cuda" and not (self._stock.packed or self._rays)
 
     @property
     def mixes_sizes(self) -> bool:
@@ -190,6 +206,8 @@ class GsplatRasterizer(Rasterizer):
     @torch.no_grad()
     def render_images(self, field: GaussianField, cameras: Sequence[Camera], *, background: Tensor) -> Tensor:
         """Render images of several cameras together; see `fields.rasterizer.Rasterizer`."""
+        if self._rays and len(cameras) > 1:
+            return super().render_images(field, cameras, background=background)
         if len(field) == 0 or self._calls_kernels(field, cameras=len(cameras)):
             images = self._images(field, cameras, background, None)
             return images[None] if len(cameras) == 1 else images
@@ -197,8 +215,8 @@ class GsplatRasterizer(Rasterizer):
 
     @property
     def can_stack(self) -> bool:
-        """Whether `stack` is available: on CUDA devices, unless gsplat renders packed."""
-        return self._device.type == "cuda" and not self._stock.packed
+        """Whether `stack` is available: on CUDA devices, unless gsplat renders packed or along rays."""
+        return self._device.type == "cuda" and not (self._stock.packed or self._rays)
 
     def stack(self, fields: Sequence[GaussianField]) -> FieldStack:
         """Copy several fields to render them together; see `fields.rasterizer.Rasterizer`."""

@@ -14,11 +14,13 @@ from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.lens import Lens
 from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.gpu_raster.cameras import cameras_on_device
 from lapgs_plugin.ops.mixed_sizes import largest_size
 from lapgs_plugin.reference_raster.layout import NEAR_DEPTH, PIXEL_VARIANCE
 from lapgs_plugin.reference_raster.oracle import footprint_radii
+from lapgs_plugin.reference_raster.rays import watched
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,13 @@ class StockRasterization:
     """Render fields of at least one Gaussian.
 
     Attributes:
-        antialiased, packed, own_radii: as in `GsplatRasterizer`.
+        antialiased, packed, own_radii, rays: as in `GsplatRasterizer`.
     """
 
     antialiased: bool = False
     packed: bool = False
     own_radii: bool = False
+    rays: bool = False
 
     def render(
         self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, *, absgrad: bool
@@ -47,10 +50,12 @@ class StockRasterization:
         """
         leading, n, means = (len(cameras),) if len(cameras) > 1 else (), len(field), field.means
         differentiated = is_differentiated(field)
-        means2d = means.new_zeros(*leading, n, 2).requires_grad_(differentiated)  # (n, 2)
-        absgrad2d = means.new_zeros(*leading, n, 2) if differentiated and absgrad else None
-        images, alphas, info = self._rasterize(field, cameras, background, degree, absgrad2d is not None)
-        if differentiated:
+        by_centres = differentiated and not self.rays
+        means2d = means.new_zeros(*leading, n, 2).requires_grad_(by_centres)  # (n, 2)
+        absgrad2d = means.new_zeros(*leading, n, 2) if by_centres and absgrad else None
+        centres = watched(means, cameras[0], means2d) if self.rays else means
+        images, alphas, info = self._rasterize(field, cameras, background, degree, absgrad2d is not None, centres)
+        if by_centres:
             _hand_over_gradients(info, means2d, absgrad2d)
         with torch.no_grad():
             radii = self._fill_centres(info, means2d)
@@ -63,9 +68,18 @@ class StockRasterization:
         return _channels_first(self._rasterize(field, cameras, background, degree, absgrad=False)[0])
 
     def _rasterize(
-        self, field: GaussianField, cameras: Sequence[Camera], background: Tensor, degree: int, absgrad: bool
+        self,
+        field: GaussianField,
+        cameras: Sequence[Camera],
+        background: Tensor,
+        degree: int,
+        absgrad: bool,
+        centres: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Return images (b, h, w, 3), opacities (b, h, w, 1) and gsplat's intermediate results."""
+        """Return images (b, h, w, 3), opacities (b, h, w, 1) and gsplat's intermediate results.
+
+        `centres` are the field's, whose gradient is watched; colours do not depend on them.
+        """
         from gsplat import rasterization
 
         means = field.means
@@ -76,7 +90,7 @@ class StockRasterization:
         if not field.signed:
             colors = torch.clamp_min(colors + 0.5, 0.0)
         result: tuple[Tensor, Tensor, dict[str, Any]] = rasterization(
-            means,
+            means if centres is None else centres,
             field.quaternions,
             torch.exp(field.log_scales),
             torch.sigmoid(field.opacity_logits),
@@ -92,6 +106,7 @@ class StockRasterization:
             backgrounds=None if self.packed else background.to(means).expand(len(cameras), 3),
             rasterize_mode="antialiased" if self.antialiased else "classic",
             absgrad=absgrad,
+            **(_along_rays(cameras, means) if self.rays else {}),
         )
         images, alphas, info = result
         return images + (1 - alphas) * background.to(means) if self.packed else images, alphas, info
@@ -112,6 +127,21 @@ class StockRasterization:
         filled = torch.zeros(means2d.shape[:-1], dtype=torch.int32, device=means2d.device)  # (n,)
         filled[rows] = torch.where(visible, sizes, 0).to(torch.int32)
         return filled
+
+
+def _along_rays(cameras: Sequence[Camera], like: Tensor) -> dict[str, Any]:
+    """Return the arguments by which gsplat evaluates Gaussians along the rays of cameras, whose lenses are of a kind.
+
+    Distortion is not differentiated, and gsplat takes it in the precision of the Gaussians.
+    """
+    lenses = [camera.lens or Lens() for camera in cameras]
+    arguments: dict[str, Any] = {"with_ut": True, "with_eval3d": True}
+    if lenses == [Lens()] * len(lenses):
+        return arguments
+    arguments["radial_coeffs"] = like.new_tensor([lens.radial for lens in lenses])  # (b, 6), (b, 4) of a fisheye
+    if lenses[0].fisheye:
+        return {**arguments, "camera_model": "fisheye"}
+    return {**arguments, "tangential_coeffs": like.new_tensor([lens.tangential for lens in lenses])}  # (b, 2)
 
 
 def is_differentiated(field: GaussianField) -> bool:

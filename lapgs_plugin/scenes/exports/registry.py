@@ -9,7 +9,7 @@ import numpy as np
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.registry import Registry
-from lapgs_plugin.scenes.colmap import refuse_distorted, source_of
+from lapgs_plugin.scenes.colmap import refuse_distorted, source_of, with_lenses
 from lapgs_plugin.scenes.colmap_model import Model, model_of
 from lapgs_plugin.scenes.colmap_records import Points
 from lapgs_plugin.scenes.exports.base import Export, PhotoFinder, SceneReader
@@ -91,13 +91,18 @@ def find_export(folder: Path) -> FoundExport | None:
     return FoundExport(*exports[0]) if exports else None
 
 
-def read_export(export: FoundExport, path: Path, images: str, evaluate: bool) -> SceneSource:
+def read_export(export: FoundExport, path: Path, images: str, evaluate: bool, distorted: bool = False) -> SceneSource:
     """Read the frames and points of an export, of which `evaluate` holds out every eighth.
+
+    With `distorted` cameras have their lenses.
 
     Raises:
         SceneError: it cannot be read, or a camera is distorted.
     """
     model, source = export.read(path, images)
-    refuse_distorted(model, path)
+    if distorted:
+        source = with_lenses(source, model, path)
+    else:
+        refuse_distorted(model, path)
     train, test = hold_out(source.train, evaluate)
     return replace(source, train=train, test=test)

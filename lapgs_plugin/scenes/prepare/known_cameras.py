@@ -16,7 +16,7 @@ import pycolmap
 from lapgs_plugin.errors import SceneError, UserInputError
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.options import option_name
-from lapgs_plugin.scenes.blender import FISHEYE, SINGLE_FILE, Lenses, has_transforms, read_transforms
+from lapgs_plugin.scenes.blender import SINGLE_FILE, Lenses, colmap_distortion, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import (
     MODEL_PLACES,
     find_model,
@@ -35,7 +35,7 @@ from lapgs_plugin.scenes.panorama import panorama_lens
 from lapgs_plugin.scenes.prepare.photos import Photos, check_targets, listed
 from lapgs_plugin.scenes.prepare.settings import PrepareSettings
 from lapgs_plugin.scenes.scene import check_shape, check_source
-from lapgs_plugin.scenes.source import ALL_AROUND, PINHOLE_MODELS, Frame, SceneSource
+from lapgs_plugin.scenes.source import ALL_AROUND, Frame, SceneSource
 
 FOLDERS = (".", "images", "input")
 """Folders in which the photos of a model may be."""
@@ -43,10 +43,6 @@ USED = ("max_size", "masks", "tripod", "model")
 """Settings that concern undistortion."""
 STRAIGHT = {"PINHOLE", "SIMPLE_PINHOLE"}
 """Camera models without distortion."""
-OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3")
-"""Distortion of perspective lenses in transforms files. Their k4 is nerfstudio's, not OpenCV's."""
-FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
-"""Distortion of fisheye lenses in transforms files."""
 
 logger = logging.getLogger(__name__)
 
@@ -269,21 +265,7 @@ def _colmap_lens(frame: Frame, kind: str, distortion: Mapping[str, object]) -> p
     camera = frame.camera
     if kind == ALL_AROUND:
         return panorama_lens(camera.size, str(frame.path))
-    model, terms = _colmap_distortion(frame, kind, distortion)
+    subject = f"{frame.path}: its camera"
+    model, terms = colmap_distortion(subject, kind, distortion, "undistorted")
     params = [camera.fx, camera.fy, camera.cx, camera.cy, *terms]
     return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
-
-
-def _colmap_distortion(frame: Frame, kind: str, distortion: Mapping[str, object]) -> tuple[str, list[float]]:
-    """Return COLMAP's camera model for a lens of a transforms file, and its distortion."""
-    if kind in PINHOLE_MODELS and not distortion:
-        return "PINHOLE", []
-    model, keys = (FISHEYE, FISHEYE_TERMS) if kind == FISHEYE else ("FULL_OPENCV", OPENCV_TERMS)
-    values = [value for key in keys if isinstance(value := distortion.get(key, 0.0), int | float)]
-    if kind not in (*PINHOLE_MODELS, FISHEYE) or set(distortion) - set(keys) or len(values) < len(keys):
-        terms = "".join(f", {key} = {value}" for key, value in distortion.items())
-        raise SceneError(
-            f"{frame.path}: its camera in the transforms file ({kind}{terms}) cannot be undistorted; expected numbers "
-            f"{', '.join(OPENCV_TERMS)}, or {', '.join(FISHEYE_TERMS)} of {FISHEYE}"
-        )
-    return model, values if kind == FISHEYE else [*values, 0.0, 0.0, 0.0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lapgs_plugin.fields.camera import Camera
@@ -57,8 +58,11 @@ def camera_rays(camera: Camera, positions: NDArray[np.float64]) -> tuple[Floats,
     """Return a camera's centre (3,) and unit directions (3, n) through image positions (2, n), in the world."""
     pose = camera.world_to_camera.double().numpy()
     plane = np.ones((3, positions.shape[1]), np.float32)
-    plane[0] = (positions[0] - camera.cx) / camera.fx
-    plane[1] = (positions[1] - camera.cy) / camera.fy
+    if camera.lens is None:
+        plane[0] = (positions[0] - camera.cx) / camera.fx
+        plane[1] = (positions[1] - camera.cy) / camera.fy
+    else:
+        plane[:] = camera.rays(torch.from_numpy(positions.T))[0].T
     directions = rotate(pose[:3, :3].T.astype(np.float32), plane)
     directions /= np.sqrt(dot(plane, plane))
     return (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32), directions
