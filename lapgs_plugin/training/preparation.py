@@ -352,8 +352,7 @@ def _require_shardable(request: TrainRequest, settings: TrainSettings, scene: Sc
     }
     if asked := [option for option, given in unable.items() if given]:
         raise UserInputError(
-            f"{', '.join(asked)} with --shard: each rank has some of the Gaussians, which that cannot be done with; "
-            "leave one out"
+            f"{', '.join(asked)} with --shard: cannot be done with Gaussians that are divided over ranks; leave one out"
         )
 
 

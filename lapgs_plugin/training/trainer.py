@@ -51,7 +51,7 @@ from lapgs_plugin.training.time_budget import StageBudget, parse_duration, requi
 from lapgs_plugin.training.warm_up import warm_up
 
 SHARDED = (
-    "--shard: each rank has a share of the Gaussians and renders one view at a time; without strategies "
+    "--shard: each rank has a share of the Gaussians and renders one view at a time; not with strategies "
     "but mcmc and 3dgs, --prune, --keep best, --refine-poses, --depth, --sky, --sparse-adam, hooks, --time, --view"
 )
 """What ranks with some of the Gaussians do, and what they do not."""
