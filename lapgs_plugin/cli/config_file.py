@@ -24,7 +24,20 @@ if TYPE_CHECKING:
     from lapgs_plugin.training.settings import TrainSettings
 
 OF_ONE_CALL = frozenset(
-    {"config", "out", "resume", "overwrite", "view", "view_port", "gpus", "processes", "tile", "base", "only_base"}
+    {
+        "config",
+        "out",
+        "resume",
+        "overwrite",
+        "view",
+        "view_port",
+        "gpus",
+        "processes",
+        "shard",
+        "tile",
+        "base",
+        "only_base",
+    }
 )
 """Parameters of a call that do not change the trained run."""
 

@@ -56,6 +56,11 @@ class StartOptions:
     processes: int | None = option(
         None, "Train on this many processes on CPUs instead, to try --gpus without GPUs.", least=1, most=1024
     )
+    shard: bool = option(
+        False,
+        "With --gpus or --processes: divide the Gaussians over the ranks, for fields larger than one GPU; see `lapgs "
+        "help scale`.",
+    )
     tiling: TileOptions = field(default_factory=TileOptions)
     viewing: ViewOptions = field(default_factory=ViewOptions)
 
@@ -66,6 +71,18 @@ class StartOptions:
             for name, value in (("--gpus", self.gpus), ("--processes", self.processes), ("--view", self.viewing.view)):
                 if value:
                     raise UserInputError(f"{name} with {self.tiling.asked}: not for tiles; leave one out")
+        if self.shard:
+            self._check_shard()
+
+    def _check_shard(self) -> None:
+        """Refuse to divide Gaussians over one rank, or to show them while they are divided."""
+        if not launcher.is_rank() and (self.gpus or self.processes or 1) == 1:
+            raise UserInputError(
+                "--shard: divides the Gaussians over several ranks; add --gpus 2 or more, --processes, or start it by "
+                "torchrun"
+            )
+        if self.viewing.view:
+            raise UserInputError("--view with --shard: no rank has all of the Gaussians to show; leave one out")
 
     def launches(self, rasterizer: str) -> bool:
         """Run this command on several ranks if that is asked for; return whether it has.
@@ -151,7 +168,7 @@ def train(
     if isinstance(context.obj, Rehearsal):
         context.obj.train(request)
         return
-    request = replace(request, ranks=joined())
+    request = replace(request, ranks=joined(), shard=start.shard)
     with prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
         if leads:

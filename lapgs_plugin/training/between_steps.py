@@ -17,7 +17,9 @@ from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.stage import StageRun
 
 CHECKPOINT_SECONDS = 60.0
-"""Time between two checkpoints unless a number of iterations is given."""
+"""Least time between two checkpoints unless a number of iterations is given."""
+CHECKPOINT_SHARE = 0.05
+"""Largest share of the time that checkpoints take then: one of tens of millions of Gaussians takes a minute itself."""
 EQUAL_EVERY = 1_000
 """Iterations between two comparisons of the ranks' fields."""
 
@@ -41,6 +43,7 @@ class BetweenSteps:
     samples: int
     last_tick: tuple[float, int]
     last_checkpoint: float = field(default_factory=time.monotonic)
+    _pause: float = field(default=CHECKPOINT_SECONDS, init=False)  # to the next checkpoint
     _schedule: StageSchedule | None = field(default=None, init=False)
     _due: Collection[int] = field(default=(), init=False)
     _steps: int = field(default=0, init=False)
@@ -100,7 +103,8 @@ class BetweenSteps:
         self._steps += 1
         if self._steps % ranks.steps_a_decision:
             return False, due
-        late = every is None and time.monotonic() - self.last_checkpoint >= CHECKPOINT_SECONDS
+        # Rank 0 says when: it writes them, which takes longest.
+        late = every is None and ranks.leads and time.monotonic() - self.last_checkpoint >= self._pause
         stop, late = ranks.decide(self.stop.requested, late)
         return stop, due or late
 
@@ -130,9 +134,10 @@ class BetweenSteps:
     def _save_checkpoint(self, run: StageRun) -> None:
         run.require_equal_fields()
         run.require_finite(run.counts.iteration)  # Gaussians of NaN are culled: the loss does not show them
-        best, overhead = self.evaluation.best, run.record.overhead
+        best, overhead, began = self.evaluation.best, run.record.overhead, time.monotonic()
         with overhead.timed("checkpoints"):
             kept: dict[str, Any] = {} if best is None else {"best": best}
             state = {**run.state(), **kept, "overhead": dict(overhead)}
             run.prepared.archive.save_checkpoint(state, extends_to=run.prepared.settings.iterations)
         self.last_checkpoint = time.monotonic()
+        self._pause = max(CHECKPOINT_SECONDS, (self.last_checkpoint - began) / CHECKPOINT_SHARE)

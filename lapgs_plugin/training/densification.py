@@ -47,9 +47,11 @@ class DensityControl:
             (n, ...) of one row a Gaussian, whose rows are edited with the field's. On several ranks they are sums over
             the views of all.
         ranks: that train the field. What is drawn or rounded at random has to be the same on all.
+        share: of the field's Gaussians that `model` has, on a rank with some of them.
     """
 
     ranks: Ranks = ALONE
+    share: float = 1.0
 
     def __init__(self, opacity_weight: float = 0.0, scale_weight: float = 0.0) -> None:
         self.state: dict[str, Any] = {}
@@ -109,8 +111,9 @@ class DensityControl:
         """
         weights = self.opacity_weight(model, iterations[-1]), self._scale_weight
         if any(weights):
+            factor = len(iterations) * self.share  # the means are those of all ranks' Gaussians
             add_regularization(
-                model.params["opacities"], model.params["scales"], *(len(iterations) * weight for weight in weights)
+                model.params["opacities"], model.params["scales"], *(factor * weight for weight in weights)
             )
 
     def opacity_weight(self, model: TrainableField, iteration: int) -> float:

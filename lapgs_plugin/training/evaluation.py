@@ -111,8 +111,11 @@ class StageEvaluation:
     def _psnrs(self, views: Sequence[View], exposures: Mapping[str, Tensor] | None = None) -> dict[str, ViewPsnr]:
         """Measure views, each on the rank that has its image, and return the figures by name in their order."""
         prepared, exposures = self.run.prepared, exposures or {}
-        photos = with_pixels(prepared.owned(views))
+        held = prepared.owned(views)
+        photos, idle = with_pixels(held), prepared.sharding.idle_rounds(len(held))
         own = {view.name: self._psnr(view, exposures.get(view.name)) for view in photos}
+        for _ in range(idle):  # other ranks have more views
+            self._renders(views[0])
         measured = {name: psnr for one in prepared.ranks.gathered(own) for name, psnr in one.items()}
         return {view.name: measured[view.name] for view in views}
 
@@ -123,14 +126,21 @@ class StageEvaluation:
         Args:
             exposure: (3, 4) colour transform from renders to the view's photo; None leaves renders unchanged.
         """
-        run, level, below = self.run, self.run.stage.level, self.run.images.held_out
-        camera = level_camera(view.camera, level)
-        camera = camera if run.poses is None else run.poses.camera(view.name, camera)
-        image = run.prepared.rasterizer(run.model.field, camera, background=run.background).image
-        coarser = None if below is None else below.get(view.name)
+        image, coarser = self._renders(view)
         whole, photo, mask = self._beside_photo(view, add_prediction(image, coarser), exposure)
         without = None if coarser is None else psnr(*self._beside_photo(view, coarser, exposure))
         return ViewPsnr(psnr(whole, photo, mask), color_fitted_psnr(whole, photo, mask), without)
+
+    @torch.no_grad()
+    def _renders(self, view: View) -> tuple[Tensor, Tensor | None]:
+        """Return a view's image (3, h, w) of the stage's field, and its prediction by coarser levels, if any."""
+        run, below = self.run, self.run.images.held_out
+        camera = level_camera(view.camera, run.stage.level)
+        camera = camera if run.poses is None else run.poses.camera(view.name, camera)
+        image = run.prepared.rasterizer(run.model.field, camera, background=run.background).image
+        if below is None or (run.joint is None and view.name not in run.prepared.own):  # another rank has it
+            return image, None
+        return image, below.get(view.name)
 
     def _beside_photo(self, view: View, image: Tensor, exposure: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return an image (3, h, w) of the level at full size as a view is photographed, the photo and its mask."""

@@ -20,11 +20,13 @@ class PlannedLaunch:
         iterations: that train them, in order.
         views: of the iterations.
         part: of the step, see `WholeSteps.own`.
+        at: the iteration whose settings they are rendered with.
     """
 
     iterations: Sequence[int]
     views: Sequence[LevelView]
     part: int
+    at: int
 
 
 @dataclass
@@ -66,18 +68,23 @@ class LaunchPlanner:
         """
         if self._last is None or self._last[0] != iterations:
             parts = enumerate(self.steps.parts(iterations))
-            self._last = iterations, [launch for part, own in parts for launch in self._of_part(part, own)]
+            self._last = iterations, [launch for part, own in parts for launch in self._of_part(part, own, iterations)]
         return self._last[1]
 
     def limit(self, most_views: int) -> None:
         """Plan launches of at most so many views from here on."""
         self.most_views, self._last = most_views, None
 
-    def _of_part(self, part: int, iterations: Sequence[int]) -> list[PlannedLaunch]:
-        """Group iterations into launches: views of similar sizes and one SH degree, no more than fit."""
+    def _of_part(self, part: int, iterations: Sequence[int], step: range) -> list[PlannedLaunch]:
+        """Group iterations of a step into launches: views of similar sizes and one SH degree, no more than fit."""
         views = [self.view(iteration) for iteration in iterations]
+
+        def together(chosen: Sequence[int]) -> PlannedLaunch:
+            own = [iterations[index] for index in chosen]
+            return PlannedLaunch(own, [views[index] for index in chosen], part, self.steps.decisive(own[-1], step))
+
         if self.size_groups is None or len(iterations) == 1:
-            return [PlannedLaunch([iteration], [view], part) for iteration, view in zip(iterations, views, strict=True)]
+            return [together([index]) for index in range(len(iterations))]
         alike: dict[tuple[bool, int, int], list[int]] = {}
         for index, (iteration, view) in enumerate(zip(iterations, views, strict=True)):
             degree = self.schedule.active_sh_degree(iteration)
@@ -90,6 +97,5 @@ class LaunchPlanner:
             count = math.ceil(len(group) / min(most, self.most_views or most))
             size = math.ceil(len(group) / count)
             for start in range(0, len(group), size):
-                chosen = group[start : start + size]
-                launches.append(PlannedLaunch([iterations[i] for i in chosen], [views[i] for i in chosen], part))
+                launches.append(together(group[start : start + size]))
         return launches

@@ -135,11 +135,12 @@ class McmcDensifier(DensityControl):
         weight = super().opacity_weight(model, iteration)
         if not model.signed:
             return weight
-        self.state["start"] = self.state["start"] or len(model)
+        count = len(model) / self.share
+        self.state["start"] = self.state["start"] or round(count)
         if iteration <= COLORLESS * self._schedule.densify_until:
             return 0.0
         # A mean over fewer Gaussians pulls harder at each: those that removal leaves would follow, to the last one.
-        return weight * min(1.0, len(model) / float(self.state["start"]))
+        return weight * min(1.0, count / float(self.state["start"]))
 
     def _move_dead(self, model: TrainableField) -> None:
         opacities = torch.sigmoid(model.params["opacities"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -223,10 +222,6 @@ class TrainableField:
             "moments": self.optimizer_moments(),
             "signed": self.signed,
         }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a result of `state` whose parameters this field was created from."""
-        self.adopt_moments(state["moments"], torch.arange(len(self)))
 
 
 def _rates(field: GaussianField, rates: LearningRates, extent: float) -> dict[str, float]:

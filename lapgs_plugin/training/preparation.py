@@ -19,6 +19,7 @@ from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError, UserInputError, counted, errors_about
 from lapgs_plugin.files import MANIFEST, one_line_errors
 from lapgs_plugin.hierarchy.settings import AUTO
+from lapgs_plugin.hooks import hooks_line
 from lapgs_plugin.options import option_values
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.rendering.run import load_reference, require_same_scene
@@ -39,7 +40,7 @@ from lapgs_plugin.training.ranks.equality import require_same
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
-from lapgs_plugin.training.settings import TrainingControl, TrainSettings
+from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.tensorboard import require_tensorboard
 from lapgs_plugin.training.time_budget import parse_duration, require_time_left
 
@@ -70,6 +71,7 @@ class TrainRequest:
 
         began: when the seconds of --time began, by `time.monotonic`.
         ranks: the processes that train it; all make the same request.
+        shard: divide the Gaussians over them.
 
     Raises:
         UserInputError: two options contradict each other.
@@ -85,6 +87,7 @@ class TrainRequest:
     chosen: frozenset[str] = frozenset({"iterations"})
     began: float = field(default_factory=time.monotonic)
     ranks: Ranks = ALONE
+    shard: bool = False
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
@@ -150,6 +153,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     if ranks.leads:  # others would see the folder that it makes to try, and takes away
         require_room(out, request.overwrite)
         require_place(out)
+    _require_shardable(request, settings, reference)
     placed = training_rasterizer(request.control.rasterizer, settings)
     _check_busy(request.control, placed, settings)
     ranks.use(placed.device)
@@ -171,6 +175,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
         require_pruning(make_plan(size, settings, photos), settings)
 
     scene = load_reference(reference, decide, **_reading(request, settings))
+    _require_points(request, scene)
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
     depth = load_depth(scene, settings.depth, reference.images, say)
@@ -189,6 +194,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
             depth=depth,
             normals=normals,
             ranks=ranks,
+            shard=request.shard,
         )
         run = _ready(run)
         _say_about_photos(run, say)
@@ -231,6 +237,7 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
         settings, changed = _continued_settings(request, reference, archive, say)
         began = request.began if changed.get("time") != settings.time and "time" in changed else None
         settings = replace(settings, **changed)
+        _require_shardable(request, settings, manifest.scene)
         with nullcontext() if changed else errors_about(file):
             placed = training_rasterizer(manifest.rasterizer, settings)
         _check_busy(request.control, placed, settings)
@@ -251,6 +258,7 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
                 depth=load_depth(scene, settings.depth, manifest.scene.images, say),
                 normals=load_normals(scene, settings.normals, say),
                 ranks=ranks,
+                shard=request.shard,
             )
         _require_same_run(ranks, scene, settings)
         run = _ready(run)
@@ -322,6 +330,39 @@ def _ready(run: PreparedRun) -> PreparedRun:
 
     scene = replace(run.scene, train=own(run.scene.train), test=own(run.scene.test))
     return replace(run, scene=scene, aside=own(run.aside))
+
+
+def _require_shardable(request: TrainRequest, settings: TrainSettings, scene: SceneReference) -> None:
+    """Refuse what a rank with some of the Gaussians cannot do."""
+    if not request.shard:
+        return
+    if request.ranks.size == 1:
+        raise UserInputError("--shard: divides the Gaussians over several ranks; add --gpus 2 or more")
+    strategy = settings.densification
+    unable = {
+        f"--strategy {strategy.strategy}": not strategy.options.shards,
+        f"--keep {settings.keep}": settings.keep == BEST,
+        f"--prune {settings.prune:g}": settings.prune > 0.0,
+        f"--depth {settings.depth}": settings.depth != NONE,
+        f"--sky {scene.sky}": scene.sky != NONE,
+        f"--time {settings.time}": settings.time is not None,
+        "--refine-poses": settings.refine_poses,
+        "--sparse-adam": settings.sparse_adam,
+        f"--hooks {settings.hooks} of installed packages": hooks_line(settings.hooks) is not None,
+    }
+    if asked := [option for option, given in unable.items() if given]:
+        raise UserInputError(
+            f"{', '.join(asked)} with --shard: cannot be done with Gaussians that are divided over ranks; leave one out"
+        )
+
+
+def _require_points(request: TrainRequest, scene: Scene) -> None:
+    """Refuse more ranks than Gaussians to begin with."""
+    if request.shard and (count := len(scene.points)) < request.ranks.size:
+        raise UserInputError(
+            f"{request.ranks.together} with --shard: the scene has {counted(count, 'point')} to start from; give at "
+            "most so many ranks"
+        )
 
 
 def _require_views(ranks: Ranks, photos: int) -> None:

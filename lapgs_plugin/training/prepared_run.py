@@ -31,6 +31,7 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.planning import iterations_continued, make_plan
 from lapgs_plugin.training.quality import set_aside, set_aside_to_stop
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
+from lapgs_plugin.training.ranks.sharding import WholeFields, sharding_of
 from lapgs_plugin.training.ranks.steps import WholeSteps, steps_of
 from lapgs_plugin.training.schedule import MOST_PADDING, StageSchedule, views_per_step
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
@@ -54,6 +55,7 @@ class PreparedRun(StagedRun):
         depth: of the training views; None without.
         normals: (3, h, w) of training views by name, as `load_normals` returns them.
         ranks: the processes that train it.
+        sharding: which Gaussians of a field this rank trains.
         part_of_views: whether its views are only some of those that the coarser levels were trained on.
     """
 
@@ -69,6 +71,7 @@ class PreparedRun(StagedRun):
     depth: DepthTargets | None
     normals: Mapping[str, Tensor]
     ranks: Ranks
+    sharding: WholeFields
     part_of_views: bool = False
 
     @classmethod
@@ -86,6 +89,7 @@ class PreparedRun(StagedRun):
         depth: DepthTargets | None = None,
         normals: Mapping[str, Tensor] | None = None,
         ranks: Ranks = ALONE,
+        shard: bool = False,
     ) -> PreparedRun:
         """Return the run of a scene in memory.
 
@@ -97,13 +101,14 @@ class PreparedRun(StagedRun):
             control, resumes, first_field, began, depth, normals, ranks: see the attributes; by default the run is new,
                 starts from the points without depth and normals, a time begins with the training, and this process
                 trains alone.
+            shard: divide the Gaussians over the ranks.
 
         Raises:
             UserInputError: as `make_plan`.
         """
         views = scene.train
         aside = set_aside(views) if settings.keep == BEST else []
-        names = {view.name for view in aside}
+        names, sharding = {view.name for view in aside}, sharding_of(ranks, shard)
         plan = make_plan(scene.smallest_size, settings, len(views))
         run = cls(
             scene=replace(scene, train=tuple(view for view in views if view.name not in names)),
@@ -112,7 +117,7 @@ class PreparedRun(StagedRun):
             plan=plan,
             planned=plan,
             archive=archive,
-            rasterizer=in_unit(placed.rasterizer, archive.manifest.scene.unit),
+            rasterizer=sharding.rasterizer(in_unit(placed.rasterizer, archive.manifest.scene.unit)),
             device=placed.device,
             control=control or TrainingControl(),
             resumes=resumes,
@@ -121,6 +126,7 @@ class PreparedRun(StagedRun):
             depth=depth,
             normals=normals or {},
             ranks=ranks,
+            sharding=sharding,
         )
         # Their lengths were decided while they were trained.
         for record in archive.manifest.records if settings.time is not None or settings.stops_early else ():
@@ -163,8 +169,8 @@ class PreparedRun(StagedRun):
 
     def steps_of(self, stage: Stage, views: int) -> WholeSteps:
         """Return which of so many views the steps of a stage have, and which of them this process renders."""
-        settings = self.settings
-        return steps_of(views, settings.seed, stage.level, settings.ranks, self.ranks, self.device)
+        settings, sharded = self.settings, self.sharding.divides
+        return steps_of(views, settings.seed, stage.level, settings.ranks, self.ranks, self.device, sharded=sharded)
 
     @cached_property
     def own(self) -> frozenset[str]:
@@ -205,14 +211,14 @@ class PreparedRun(StagedRun):
 
     def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
         """Return the density control of a stage."""
-        control = control_of(self.strategy_of(stage), schedule, self.scene.extent)
-        control.ranks = self.ranks
+        control = control_of(self.sharding.strategy(self.strategy_of(stage)), schedule, self.scene.extent)
+        control.ranks = self.sharding.edits_with(self.ranks)
         return control
 
     def schedule_of(self, stage: Stage) -> StageSchedule:
         """Return the schedule of a stage."""
         views = len(self.scene.train)
-        together = views_per_step(self.settings, stage, views, self.batches)
+        together = self.steps_of(stage, views).trained(views_per_step(self.settings, stage, views, self.batches))
         return StageSchedule.create(self.settings, stage, iterations_continued(self.plan, stage), together, views)
 
     def record_to_extend(self, stage: Stage) -> LevelRecord | None:
@@ -222,12 +228,13 @@ class PreparedRun(StagedRun):
         return done if done is not None and done.iterations < whole else None
 
     def model(self, field: GaussianField) -> TrainableField:
-        """Return a field ready to be trained on the device, with empty moments."""
+        """Return those Gaussians of a field that this rank trains, ready on the device, with empty moments."""
         rates, extent, sparse = self.settings.rates, self.scene.extent, self.settings.sparse_adam
-        return TrainableField.create(field.to(self.device), rates, extent, sparse=sparse)
+        return TrainableField.create(self.sharding.dealt(field).to(self.device), rates, extent, sparse=sparse)
 
     def restored_model(self, state: dict[str, Any]) -> TrainableField:
         """Return the model of a `TrainableField.state`, on the device."""
-        model = self.model(field_from_splats(state["params"], state["signed"]))
-        model.restore(state)
+        field = field_from_splats(state["params"], state["signed"])
+        model = self.model(field)
+        model.adopt_moments(state["moments"], self.sharding.rows(len(field)))
         return model

@@ -576,7 +576,8 @@ class TrainingControl(MeasuringOptions):
     )
     checkpoint_every: int | None = option(
         None,
-        "Iterations between checkpoints. Default: one a minute. Ctrl-C writes one, too.",
+        "Iterations between checkpoints. Default: one a minute, fewer where writing one takes long. Ctrl-C writes one, "
+        "too.",
         panel=RUN,
         least=1,
     )

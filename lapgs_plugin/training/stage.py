@@ -129,7 +129,7 @@ class StageRun:
         self._rasterizer, self._breakdown = prepared.rasterizer, self.record.breakdown
         self._views = self._trained_views()
         self._steps = prepared.steps_of(stage, len(self._views))
-        self._sums = StepSums(self._steps) if self._steps.shared else None
+        self._sums = StepSums(self._steps) if self._steps.summed else None
         for learned in filter(None, self.transforms.values()):
             learned.ranks = prepared.ranks
         self.background = torch.zeros(3, device=prepared.device) if stage.signed else prepared.background
@@ -163,6 +163,7 @@ class StageRun:
             breakdown=self._breakdown,
             steps=self._steps,
         )
+        self._count_all()
 
     def run(self, after_iteration: Callable[[StageRun], None]) -> None:
         """Train to the end of the stage, from the iteration in `record`. An iteration is a view, a step one or more.
@@ -235,6 +236,7 @@ class StageRun:
         statistics = self.densifier.state
         self.densifier = self.prepared.density_control(self.stage, self.schedule)
         self.densifier.state = statistics
+        self._count_all()
         joint_from = self._settings.joint_from(self.stage) if self.joint is None else self._planner.joint_from
         self._planner = replace(self._planner, schedule=self.schedule, joint_from=joint_from)
         for learned in filter(None, self.transforms.values()):
@@ -284,16 +286,23 @@ class StageRun:
         self.images.drop_predictions()
         self.joint = joint_fields(self.prepared, self.poses, states)
         self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
+        self._count_all()
 
     @property
     def _models(self) -> list[TrainableField]:
         """The fields under training."""
         return [self.model, *(() if self.joint is None else self.joint.models.values())]
 
+    def _count_all(self) -> None:
+        """Learn the number of Gaussians that all ranks together have, and this one's share of it."""
+        total, own = self.prepared.sharding.total, sum(map(len, self._models))
+        self._elsewhere = total(own) - own
+        self.densifier.share = len(self.model) / max(1, total(len(self.model)))
+
     @property
     def num_optimized(self) -> int:
         """Number of Gaussians under training: the stage's own and those of jointly trained fields."""
-        return sum(map(len, self._models))
+        return sum(map(len, self._models)) + self._elsewhere
 
     @property
     def fields(self) -> dict[int, GaussianField]:
@@ -327,7 +336,8 @@ class StageRun:
         launches = self._run_launches(iterations)
         self._breakdown.mark("backward")
         self._sum_over_ranks(iterations)
-        self.densifier.regularize(self.model, iterations)
+        trained = self._steps.trained(len(iterations))
+        self.densifier.regularize(self.model, range(last - trained + 1, last + 1))
         self._count_gaussians(launches)
         self._breakdown.mark("other")
         context, self._context = self._context, None
@@ -338,7 +348,7 @@ class StageRun:
             self.schedule.means_learning_rate(last) * self.prepared.scene.extent,
             self.schedule.sh_rest_factor_at(last),
         )
-        scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(len(iterations))
+        scale = ONE_VIEW if self.schedule.gathers(last) else StepScale.of(trained)
         active = None if self._inherits_moments else (self.schedule.active_sh_degree(last) + 1) ** 2
         self.model.step(means_rate, active, rest, scale)
         if self.joint is not None:
@@ -365,7 +375,7 @@ class StageRun:
 
     def _count_gaussians(self, launches: Sequence[_Launch]) -> None:
         """Count the Gaussians of a step for each of its views."""
-        if self._sums is None:
+        if not self._steps.shared:
             self.counts.gaussian_steps += sum(launch.gaussians * launch.views for launch in launches)
         else:
             self.counts.gaussian_steps += self.num_optimized * self.step_views
@@ -424,7 +434,7 @@ class StageRun:
 
     def _launch(self, planned: PlannedLaunch, then: PlannedLaunch | None) -> _Launch:
         """Render some views of a step and propagate their losses back; the images of `then` are prefetched."""
-        iterations, last = planned.iterations, planned.iterations[-1]
+        iterations, last = planned.iterations, planned.at
         if self.joint is None and self._planner.is_joint(last):
             self.train_jointly(None)
         views = [at_pose(view, self.poses) for view in planned.views]
@@ -436,7 +446,7 @@ class StageRun:
         self._breakdown.mark("forward")
         gaussians = self.model.field
         share = self._dropout * self.schedule.progress_at(last)
-        draws = self._steps.generator(last, gaussians.means.device) if share else None
+        draws = self._steps.generator(iterations[-1], gaussians.means.device) if share else None
         shown = thinned(gaussians, share, draws)
         shown = shown if self.poses is None else self.poses.watched(names[0], shown)
         rendered, result = self._render(shown, cameras, last)
@@ -522,6 +532,8 @@ class StageRun:
             gone = self._scoring.least_visible(self.model.field.detach(), share)
             remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
             changed = True
+        if changed:
+            self._count_all()
         if changed and context is not None:
             self.hooks.on_densify(context)
         self.counts.peak_gaussians = max(self.counts.peak_gaussians, self.num_optimized)
@@ -544,7 +556,9 @@ class StageRun:
             raise self._diverged(str(error), iteration) from error
 
     def require_equal_fields(self) -> None:
-        """Raise a RanksDifferError if the ranks' fields have come apart."""
+        """Raise a RanksDifferError if the ranks' fields should be equal and have come apart."""
+        if self.prepared.sharding.divides:
+            return
         where = f"level {self.stage.level}, iteration {self.counts.iteration}"
         require_equal_fields(self.prepared.ranks, self._models, where)
 
@@ -557,7 +571,7 @@ class StageRun:
     def state(self) -> dict[str, Any]:
         """Return everything needed to continue this stage to the same bits, as plain tensors and numbers."""
         self.settle()
-        on_gpu = self._device.type == "cuda"
+        on_gpu, whole = self._device.type == "cuda", self.prepared.sharding.whole
         return {
             "level": self.stage.level,
             "counts": vars(self.counts),
@@ -566,9 +580,9 @@ class StageRun:
             "breakdown": self._breakdown.seconds(),
             "budget": None if self.budget is None else self.budget.state(),
             "gains": None if self.gains is None else self.gains.state(),
-            "model": self.model.state(),
-            "densifier": self.densifier.state,
-            "joint": None if self.joint is None else self.joint.state(),
+            "model": whole(self.model.state()),
+            "densifier": whole(self.densifier.state),
+            "joint": None if self.joint is None else whole(self.joint.state()),
             **{name: None if learned is None else learned.state() for name, learned in self.transforms.items()},
             "random": torch.get_rng_state(),
             **({"random_gpu": torch.cuda.get_rng_state(self._device)} if on_gpu else {}),
@@ -577,8 +591,9 @@ class StageRun:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a result of `state`; model and record must have been made from it already."""
         self.loss, self._planner.most_views = state["loss"], state["most_views"]
+        rows = self.prepared.sharding.rows
         self.densifier.state = {
-            name: value.to(self._device) if isinstance(value, Tensor) else value
+            name: value[rows(len(value))].to(self._device) if isinstance(value, Tensor) else value
             for name, value in state["densifier"].items()
         }
         if (joint := state.get("joint")) is not None:
@@ -587,6 +602,7 @@ class StageRun:
         torch.set_rng_state(state["random"])
         if "random_gpu" in state:
             torch.cuda.set_rng_state(state["random_gpu"], self._device)
+        self.prepared.sharding.draw_apart()
 
     def restore_transforms(self, state: Mapping[str, Any]) -> None:
         """Restore the learned transforms of the training views from a result of `state`."""

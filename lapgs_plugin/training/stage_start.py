@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.gaussian_field import GaussianField
@@ -44,7 +44,7 @@ def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
     if continues_field(stage, run.plan.levels):
         field = archive.field(stage.level + 1)
         model = run.model(field)
-        model.adopt_moments(_moments(run, stage.level + 1, field), torch.arange(len(field)))
+        model.adopt_moments(_moments(run, stage.level + 1, field), run.sharding.rows(len(field)))
         return model
     if not stage.signed:
         return run.model(_field_of_points(run, stage) if run.first_field is None else run.first_field)
@@ -52,7 +52,7 @@ def first_model(run: PreparedRun, stage: Stage) -> TrainableField:
     field, kept = run.inherited(coarser, settings.sh_degree)
     model = run.model(field)
     if settings.inherit_mode == "full":
-        model.adopt_moments(_moments(run, stage.level + 1, coarser), kept)
+        model.adopt_moments(_moments(run, stage.level + 1, coarser), kept[run.sharding.rows(len(kept))])
     return model
 
 
@@ -85,13 +85,18 @@ def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
 
 def predict_views(run: PreparedRun, stage: Stage, images: StageImages, overhead: Overhead) -> None:
     """Cache predictions I_hat^(l+1) of all views, at their refined poses, for the residual stage of level l."""
-    coarser, renderer = stage.level + 1, HierarchyRenderer.from_archive(run.archive, run.rasterizer, run.device)
+    coarser, whole = stage.level + 1, HierarchyRenderer.from_archive(run.archive, run.rasterizer, run.device)
+    renderer = replace(whole, fields={level: run.sharding.dealt(field) for level, field in whole.fields.items()})
 
     def cached(views: Sequence[View], name: str, where: str) -> UpsampledImages:
         cameras = {view.name: view.camera for view in refined_views(run.archive, views)}
-        return images.cache(
+        idle = run.sharding.idle_rounds(len(views))
+        predictions = images.cache(
             coarser, name, sizes_of(views), lambda view: renderer.images([cameras[view]], coarser)[0], where
         )
+        for _ in range(idle):  # other ranks have more views
+            renderer.images([run.scene.train[0].camera], coarser)
+        return predictions
 
     where = run.settings.images_on
     with overhead.timed("cache"):

@@ -78,6 +78,7 @@ class Strategy:
         residual_joint: default of `TrainSettings.joint`; None for the hierarchy's.
         residual_color_rate: default of `TrainSettings.residual_color_rate`; None for the hierarchy's.
         large_split: default of `TrainSettings.split` of two levels for large images; None for that of all others.
+        shards: whether it can edit shards of a field, each by itself, and at the same iterations.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -87,6 +88,7 @@ class Strategy:
     residual_joint: ClassVar[float | None] = None
     residual_color_rate: ClassVar[float | None] = None
     large_split: ClassVar[str | None] = None
+    shards: ClassVar[bool] = False
 
     @property
     def needs_absgrad(self) -> bool:
@@ -99,6 +101,10 @@ class Strategy:
 
     def of_stage(self, part: StagePart) -> Self:
         """Return the options of one stage."""
+        return self
+
+    def of_shard(self, shards: int) -> Self:
+        """Return the options of one of so many equal shards of a field, given the result of `of_stage`."""
         return self
 
     @property
@@ -161,6 +167,8 @@ class Regularized(Strategy):
 class Gradients(Regularized):
     """Clone and split by screen-space gradients, prune by opacity and size: 3DGS's heuristics, by gsplat."""
 
+    shards: ClassVar[bool] = True
+
     grow_grad2d: float | None = option(
         None,
         "Screen-space gradient, in normalised device coordinates, above which --strategy 3dgs clones or splits a "
@@ -192,6 +200,8 @@ class Gradients(Regularized):
 @dataclass(frozen=True)
 class Multiview(Gradients):
     """Clone and split only where several views have large errors: the idea of FastGS (Ren et al. 2025)."""
+
+    shards: ClassVar[bool] = False  # scores are of views that other ranks have
 
     split_absgrad2d: float = option(
         ABSGRAD_THRESHOLD,
@@ -244,6 +254,7 @@ class Mcmc(Regularized):
     residual_joint: ClassVar[float | None] = 0.5
     residual_color_rate: ClassVar[float | None] = 1.0
     large_split: ClassVar[str | None] = "2/3,1/3"
+    shards: ClassVar[bool] = True
     unused: ClassVar[tuple[str, ...]] = (
         *("prune", "coarse_threshold", "residual_threshold", "residual_resets", "reset_every"),
     )
@@ -275,6 +286,10 @@ class Mcmc(Regularized):
         if weight is None and part.signed:
             weight = self.default_weight * min(1.0, FREE_VIEWS / part.views)
         return replace(self, cap_max=limit, opacity_regularization=weight)
+
+    def of_shard(self, shards: int) -> Self:
+        assert self.cap_max is not None, "`of_stage` sets it"
+        return replace(self, cap_max=max(1, self.cap_max // shards))
 
     @property
     def most(self) -> int | None:

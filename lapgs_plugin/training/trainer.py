@@ -50,6 +50,12 @@ from lapgs_plugin.training.stage_start import (
 from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
 from lapgs_plugin.training.warm_up import warm_up
 
+SHARDED = (
+    "--shard: each rank has a share of the Gaussians and renders one view at a time; not with strategies "
+    "but mcmc and 3dgs, --prune, --keep best, --refine-poses, --depth, --sky, --sparse-adam, hooks, --time, --view"
+)
+"""What ranks with some of the Gaussians do, and what they do not."""
+
 
 @dataclass
 class Trainer:
@@ -175,6 +181,8 @@ class Trainer:
         if (ranks := self.prepared.ranks).size > 1:
             views = [str(self.prepared.schedule_of(stage).views) for stage in self.prepared.plan]
             say(f"{ranks.together}: {' and '.join(views)} views a step are shared out, coarsest level first")
+        if self.prepared.sharding.divides:
+            say(SHARDED)
         if settings.refine_poses and self.prepared.device.type == "cuda":
             say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 
@@ -295,6 +303,7 @@ class Trainer:
         """Return the field to train, from the checkpoint or as a stage starts with it."""
         # For random split positions, which a resumed run repeats.
         torch.manual_seed(self.prepared.settings.seed * 1000 + stage.level)
+        self.prepared.sharding.draw_apart()
         if checkpoint is not None:
             return self.prepared.restored_model(checkpoint["model"])
         with overhead.timed("inheritance"):
@@ -326,7 +335,7 @@ class Trainer:
         prepared, poses = self.prepared, first_poses(self.prepared, stage)
         appearance, falloffs = first_appearance(prepared, stage, checkpoint, record.overhead, self.monitor)
         if record.counts.iteration == 0:
-            record.counts.start_gaussians = len(model)
+            record.counts.start_gaussians = prepared.sharding.total(len(model))
         return StageRun(
             prepared=prepared,
             stage=replace(stage, iterations=schedule.end),
@@ -348,7 +357,8 @@ class Trainer:
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:
         """Check a checkpoint against the stage, and continue from it."""
         path = self.prepared.archive.path(CHECKPOINT)
-        check_densifier(checkpoint["densifier"], run.densifier.state, len(run.model), path)
+        count = len(checkpoint["model"]["params"]["means"])
+        check_densifier(checkpoint["densifier"], run.densifier.state, count, path)
         for name, learned in run.transforms.items():
             shape = None if learned is None else learned.transforms.shape
             check_transforms(checkpoint.get(name), shape, name, path)
@@ -358,12 +368,13 @@ class Trainer:
 
     def _archive_stage(self, run: StageRun, extends: bool) -> None:
         """Archive a finished stage, or the longer training of one that was finished before."""
-        stage, field = run.stage, run.model.field.detach()
+        stage, whole = run.stage, self.prepared.sharding.whole
+        fields = {level: field.with_parameters(whole(field.parameters)) for level, field in run.fields.items()}
+        field = fields.pop(stage.level)
         settings, archive = self.prepared.settings, self.prepared.archive
-        record, joint = run.record.of_level(len(field)), run.joint
+        record, along = run.record.of_level(len(field)), fields
         if run.gains is not None:
             record = replace(record, decided=run.gains.length)
-        along = {} if joint is None else joint.fields
         exposure = None if run.appearance is None else run.appearance.archived()
         grids = None if run.appearance is None else run.appearance.archived_grids()
         poses = None if run.poses is None else run.poses.archived()
@@ -372,7 +383,7 @@ class Trainer:
             archive.finish_extension(record, {**along, stage.level: field}, exposure, poses, grids, extended)
         else:
             inherited = stage.level > 0 and settings.inherit_mode == "full"
-            moments = run.model.optimizer_moments() if inherited else None
+            moments = whole(run.model.optimizer_moments()) if inherited else None
             archive.finish_level(record, field, moments, along or None, exposure, poses, grids)
         for line in run.record.weak_lines():
             self.monitor.say(line)

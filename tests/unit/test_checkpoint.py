@@ -7,11 +7,14 @@ import io
 import logging
 import pickle
 import signal
+import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,6 +25,7 @@ from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
+from lapgs_plugin.training import between_steps
 from lapgs_plugin.training.checkpoint import check_densifier
 from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -286,3 +290,25 @@ def test_the_checkpoint_itself_is_fine(stopped: Path, scene: Scene) -> None:
     """Last in this file, because the run ends."""
     resume(stopped, scene, SETTINGS)
     assert RunArchive.open(stopped).manifest.complete
+
+
+@pytest.mark.parametrize(("seconds", "between"), [(0.0, 60), (2.0, 60), (5.0, 100)])
+def test_checkpoints_take_a_twentieth_of_the_time_at_most(
+    seconds: float, between: int, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, saved = [time.monotonic()], []
+
+    def step() -> float:
+        now[0] += 0.5
+        return now[0]
+
+    def save(archive: RunArchive, state: Saved, extends_to: int | None = None) -> None:
+        now[0] += seconds
+        saved.append(now[0])
+
+    monkeypatch.setattr(between_steps, "time", SimpleNamespace(monotonic=step))
+    monkeypatch.setattr(RunArchive, "save_checkpoint", save)
+    train(tmp_path / "run", scene, TrainSettings(iterations=900, levels=1, sh_degree=0, densification=Densification()))
+    pauses = [later - earlier - seconds for earlier, later in pairwise(saved)]
+    assert pauses
+    assert all(between <= pause <= between + 15 for pause in pauses)

@@ -24,6 +24,8 @@ PATIENCE = timedelta(days=1)
 """How long a rank waits for the others: a viewer may hold training. Ranks that die are noticed at once."""
 STEPS_A_DECISION = 8
 """Steps from one decision in common to the next on GPUs: each costs about 0.1 ms, and a step a few."""
+ROWS_OF_A_MESSAGE = 1 << 20
+"""Rows of a tensor that are sent to rank 0 at once: gloo's messages have a limit."""
 
 _Value = TypeVar("_Value")
 
@@ -87,6 +89,22 @@ class Ranks(Processes):
 
     def as_leader(self, tensor: Tensor) -> Tensor:
         """Return the tensor of rank 0, for results that a GPU may round otherwise each time; all have its shape."""
+        return tensor
+
+    def exchange(self, rows: Tensor, counts: Sequence[int], received: Sequence[int]) -> Tensor:
+        """Send rows of a tensor (n, c) to all ranks: the first `counts[0]` to rank 0, and so on.
+
+        Args:
+            rows: without gradients.
+            counts, received: numbers of rows that this rank sends to each, and that each sends to this one.
+
+        Returns:
+            Rows that arrived, those of rank 0 first.
+        """
+        return rows
+
+    def rows_of_all(self, tensor: Tensor) -> Tensor:
+        """Return the rows of all ranks' tensors, one after the other, on rank 0's processor; others keep theirs."""
         return tensor
 
     def close(self) -> None:
@@ -202,6 +220,28 @@ class JoinedRanks(Ranks):
         with self._others():
             self._dist.broadcast(tensor, src=0, group=self._sums)
         return tensor
+
+    def exchange(self, rows: Tensor, counts: Sequence[int], received: Sequence[int]) -> Tensor:
+        arrived = rows.new_empty(sum(received), *rows.shape[1:])
+        with self._others():
+            self._dist.all_to_all_single(arrived, rows.contiguous(), [*received], [*counts], group=self._sums)
+        return arrived
+
+    def rows_of_all(self, tensor: Tensor) -> Tensor:
+        counts, own = self.gathered(len(tensor)), tensor.detach().cpu().contiguous()
+        whole = own.new_empty(sum(counts), *own.shape[1:]) if self.leads else own
+        with self._others():
+            if not self.leads:
+                for part in torch.split(own, ROWS_OF_A_MESSAGE) if len(own) else ():
+                    self._dist.send(part, 0)
+                return own
+            start = counts[0]
+            whole[:start] = own
+            for rank, count in enumerate(counts[1:], start=1):
+                for part in torch.split(whole[start : start + count], ROWS_OF_A_MESSAGE) if count else ():
+                    self._dist.recv(part, rank)
+                start += count
+        return whole
 
     def close(self) -> None:
         if self._sums is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.ranks.shards import epoch_order, shards_of, tree_sum
-from lapgs_plugin.training.views import view_index
+from lapgs_plugin.training.views import shuffled, view_index
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,9 @@ class WholeSteps:
     level: int
 
     shared = False
-    """Whether sums over views are made by shards."""
+    """Whether several ranks may render the views of a step."""
+    summed = False
+    """Whether gradients and statistics are summed over ranks, by shards."""
 
     @property
     def ranks(self) -> Ranks:
@@ -37,6 +40,14 @@ class WholeSteps:
     def view(self, iteration: int) -> int:
         """Return the index of the view that an iteration, from 1, trains."""
         return view_index(iteration, self.views, self.seed, self.level)
+
+    def trained(self, views: int) -> int:
+        """Return how many views a step of so many trains."""
+        return views
+
+    def decisive(self, iteration: int, step: range) -> int:
+        """Return the iteration whose settings the view of an iteration of a step is rendered with."""
+        return iteration
 
     def turn(self, iteration: int) -> int:
         """Return a number that decides whether what is due in every so many iterations is due in this one."""
@@ -80,7 +91,7 @@ class SharedSteps(WholeSteps):
     group: Ranks
     exact: bool
 
-    shared = True
+    shared = summed = True
 
     @property
     def ranks(self) -> Ranks:
@@ -121,7 +132,41 @@ class SharedSteps(WholeSteps):
         return torch.Generator(device).manual_seed(draw % 2**63)
 
 
-def steps_of(views: int, seed: int, level: int, started_on: int, ranks: Ranks, device: torch.device) -> WholeSteps:
+@dataclass(frozen=True)
+class ShardedSteps(SharedSteps):
+    """Train a view of each rank in turn, so that all ranks render at the same time.
+
+    A step has equally many views of each rank. If it has to end sooner, ranks render their next views all the same, and
+    render them again in the next step.
+    """
+
+    summed = False
+
+    def view(self, iteration: int) -> int:
+        turn, rank = divmod(iteration - 1, self.group.size)
+        own = range(rank, self.views, self.group.size)
+        epoch, position = divmod(turn, len(own))
+        return own[shuffled(len(own), self.seed, self.level, epoch * self.group.size + rank)[position]]
+
+    def trained(self, views: int) -> int:
+        return math.ceil(views / self.group.size) * self.group.size
+
+    def decisive(self, iteration: int, step: range) -> int:
+        return step[-1]  # ranks render together
+
+    def own(self, views: Sequence[int]) -> list[list[int]]:
+        return [[view for view in views if view % self.group.size == self.group.rank]]
+
+    def parts(self, iterations: Sequence[int]) -> list[list[int]]:
+        if not iterations:
+            return [[]]
+        whole = range(iterations[0], iterations[0] + self.trained(len(iterations)))
+        return [[iteration for iteration in whole if (iteration - 1) % self.group.size == self.group.rank]]
+
+
+def steps_of(
+    views: int, seed: int, level: int, started_on: int, ranks: Ranks, device: torch.device, *, sharded: bool
+) -> WholeSteps:
     """Return the steps of a stage.
 
     Args:
@@ -130,7 +175,10 @@ def steps_of(views: int, seed: int, level: int, started_on: int, ranks: Ranks, d
         started_on: number of ranks that the run was started on, which decides its sums.
         ranks: that train it now.
         device: of training.
+        sharded: whether the ranks have different Gaussians.
     """
+    if sharded:
+        return ShardedSteps(views, seed, level, ranks.size, ranks, exact=False)
     if started_on == 1:
         return WholeSteps(views, seed, level)
     return SharedSteps(views, seed, level, shards_of(started_on), ranks, exact=device.type == "cpu")
