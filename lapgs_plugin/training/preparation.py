@@ -346,6 +346,7 @@ def _require_shardable(request: TrainRequest, settings: TrainSettings, scene: Sc
         f"--depth {settings.depth}": settings.depth != NONE,
         f"--sky {scene.sky}": scene.sky != NONE,
         f"--time {settings.time}": settings.time is not None,
+        "--distorted": settings.distorted,
         "--refine-poses": settings.refine_poses,
         "--sparse-adam": settings.sparse_adam,
         f"--hooks {settings.hooks} of installed packages": hooks_line(settings.hooks) is not None,

@@ -194,6 +194,7 @@ def test_more_ranks_than_points_are_refused(tmp_path: Path) -> None:
     [
         ({"densification": Densification(strategy="multiview")}, "--strategy multiview with --shard"),
         ({"keep": "best", "refine_poses": True}, "--keep best, --refine-poses with --shard"),
+        ({"distorted": True}, "--distorted with --shard"),
         ({"prune": 0.01, "densification": Densification(strategy="3dgs")}, "--prune 0.01 with --shard"),
         ({"depth": "points"}, "--depth points with --shard"),
         ({"time": "1m"}, "--time 1m with --shard"),
