@@ -15,7 +15,7 @@ from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.checkouts.syntax import called_methods, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import checkout_loss, checkout_rotations
+from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.late_numbers import reading_late
@@ -77,6 +77,7 @@ class StageReplacements:
             *self._in_losses(profile),
             *self._in_reports(profile),
             *self._in_rotations(profile),
+            *checkout_filters.replacements(profile.model, "training() when it renders and densifies"),
             *parts.replacements(profile, adapter.info),
         ]
 
