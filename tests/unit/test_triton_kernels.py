@@ -393,6 +393,23 @@ depths, expected = in_triton.nearest_depths_triton(means, cameras), in_torch.nea
 assert torch.equal(depths.isinf(), expected.isinf()) and 0.3 < depths.isinf().float().mean() < 0.7
 torch.testing.assert_close(depths, expected, rtol=1e-5, atol=1e-6)
 """
+GIVEN_NOISE = """
+import torch
+from lapgs_plugin.ops.position_noise.in_triton import shake_triton
+from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 700):
+    means, noise, quaternions = torch.randn(n, 3), torch.randn(n, 3), torch.randn(n, 4)
+    scales, opacities = torch.rand(n, 3), 0.1 * torch.rand(n, 1)
+    opacities[::5] = 1.0
+    matrices = scaled_rotations_torch(scales.double(), quaternions.double())
+    share = 0.7 * torch.sigmoid(100 * (0.005 - opacities.double()))
+    moved = (matrices @ matrices.mT @ (noise.double() * share)[:, :, None])[:, :, 0]
+    expected = means.double() + moved
+    shake_triton(means, noise, scales, quaternions, opacities, 0.7)
+    torch.testing.assert_close(means.double(), expected, rtol=0, atol=2e-6)
+"""
 COMPILED_ROWS = """
 import torch
 import triton
@@ -420,8 +437,8 @@ assert "mul.f32" in assembly[0] and "add.f32" in assembly[0] and "sqrt.rn.f32" i
 assert "fma" not in assembly[0]
 """
 
-NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations", "grids", "filters"]
-ALONE = [ROWS, QUATERNIONS, ROTATIONS, GRIDS, FILTERS]
+NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations", "grids", "filters", "given noise"]
+ALONE = [ROWS, QUATERNIONS, ROTATIONS, GRIDS, FILTERS, GIVEN_NOISE]
 
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
