@@ -18,6 +18,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_noise, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
+from lapgs_plugin.runner.kept_memory import keeping_memory
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import timing_replacements
 from lapgs_plugin.runner.visible_rows import VisibleRows
@@ -202,7 +203,8 @@ class StageReplacements:
         def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             outermost, self._controlling = not self._controlling, True
             try:
-                result = original(gaussians, *args, **kwargs)
+                with keeping_memory():
+                    result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
             if outermost and (stage := self._stages.running) is not None and stage.trains(gaussians):
