@@ -1,7 +1,7 @@
 """Filter a checkout's Gaussians in space by our kernels, where its own model does the same.
 
-Its properties take some 75 launches an iteration with their gradients. Filters themselves are made by a loop over all
-cameras, with some 25 launches and five waits for each.
+Its properties take 55 launches an iteration with their gradients. Filters themselves are made by a loop over all
+cameras, with some 35 launches and five waits for each.
 """
 
 from __future__ import annotations

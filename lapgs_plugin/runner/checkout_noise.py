@@ -1,6 +1,6 @@
 """Shake a checkout's positions in one kernel, where its own statements do the same.
 
-Two of them multiply a matrix of three rows for each Gaussian, for which PyTorch has no fast way, and there are some 25
+Two of them multiply a matrix of three rows for each Gaussian, for which PyTorch has no fast way, and there are 16
 launches more. Noise is drawn by PyTorch, as in the checkout, so that its generators stay as they would be.
 """
 
