@@ -86,11 +86,17 @@ def computing(original: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _our_scales(gaussians: Any) -> Tensor:
-    return smoothing_filter.filtered_scales(gaussians._scaling, getattr(gaussians, FILTERS))
+    return smoothing_filter.filtered_scales(gaussians._scaling, _filters_of(gaussians))
 
 
 def _our_opacities(gaussians: Any) -> Tensor:
-    return smoothing_filter.filtered_opacities(gaussians._opacity, gaussians._scaling, getattr(gaussians, FILTERS))
+    return smoothing_filter.filtered_opacities(gaussians._opacity, gaussians._scaling, _filters_of(gaussians))
+
+
+def _filters_of(gaussians: Any) -> Tensor:
+    """Return a model's filters, one for each Gaussian; models of archived fields have one for all."""
+    filters: Tensor = getattr(gaussians, FILTERS)
+    return filters.expand(len(gaussians._scaling), 1).contiguous()
 
 
 @torch.no_grad()
@@ -132,8 +138,8 @@ def _fits(gaussians: Any) -> bool:
     log_scales, logits = gaussians._scaling, gaussians._opacity
     if not (_is_rows(log_scales, 3) and _is_rows(logits, 1) and _is_rows(filters, 1)):
         return False
-    alike = {(len(value), value.device) for value in (log_scales, logits, filters)}
-    return len(alike) == 1 and not filters.requires_grad
+    fit = len(log_scales) == len(logits) and len(filters) in (1, len(logits)) and not filters.requires_grad
+    return fit and log_scales.device == logits.device == filters.device
 
 
 def _is_rows(value: Any, columns: int) -> bool:

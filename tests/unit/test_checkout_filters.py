@@ -133,6 +133,19 @@ def test_ours_do_the_same(
     assert all(isinstance(value, property) for value in properties)
 
 
+def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: list[str]) -> None:
+    """As models of archived fields have it, whose filters are in their scales."""
+    module = load_module(_plain(MODEL))
+    model = _model(module)
+    model.filter_3D = torch.full((1, 1), 0.3)
+    expected = model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter
+    with Attachment(checkout_filters.replacements(module.Model, "the test")):
+        ours = model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter
+    for one, other in zip(ours, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    assert set(on_gpu) == {"filtered_opacities", "filtered_scales"}
+
+
 @pytest.mark.parametrize(
     ("written", "instead", "unreplaced"),
     [
@@ -168,7 +181,7 @@ def test_what_differs_stays(
     assert set(on_gpu) == {name for key, name in names.items() if key != unreplaced}
 
 
-@pytest.mark.parametrize("kind", ["cpu", "activation", "one filter", "strided", "none seen", "other cameras"])
+@pytest.mark.parametrize("kind", ["cpu", "activation", "no rows", "strided", "none seen", "other cameras"])
 def test_what_does_not_fit_is_the_checkouts(
     load_module: Callable[[str], ModuleType], on_gpu: list[str], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
@@ -178,8 +191,8 @@ def test_what_does_not_fit_is_the_checkouts(
         monkeypatch.undo()
     elif kind == "activation":
         model.scaling_activation = model.opacity_activation = torch.nn.functional.softplus
-    elif kind == "one filter":
-        model.filter_3D = torch.zeros(1, 1)
+    elif kind == "no rows":
+        model.filter_3D = torch.zeros(1)
     elif kind == "strided":
         model._scaling = model._scaling.detach().T.contiguous().T
     elif kind == "none seen":
