@@ -7,6 +7,7 @@ cameras, with some 35 launches and five waits for each.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import cache, partial, wraps
@@ -169,7 +170,10 @@ def _property_difference(
         probe = type("Probe", (), own)()
         leaves = [value.clone().requires_grad_() for value in (logits, log_scales)]
         vars(probe).update({"_opacity": leaves[0], "_scaling": leaves[1], FILTERS: filters, **ACTIVATIONS})
+        before = set(vars(probe))
         output = read(probe)
+        if set(vars(probe)) != before:
+            return math.inf  # it does more
         gradients = torch.autograd.grad((output * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
         results.append((output, *gradients))
     return largest(map(_apart, *results))
@@ -180,8 +184,11 @@ def _filter_difference(original: Callable[..., Any], said: list[str], device: to
     means, rows = seen_from(device)
     cameras = [_Camera.of(row) for row in rows.cpu().numpy().astype(np.float64)]
     probe = SimpleNamespace(get_xyz=means, _xyz=means)
+    before = set(vars(probe))
     with redirect_stdout(io.StringIO()) as text:
-        original(probe, cameras)
+        returned = original(probe, cameras)
+    if returned is not None or vars(probe).keys() != before | {FILTERS}:
+        return math.inf  # it does more
     said[:] = [text.getvalue()]
     ours = _filters(means, cameras)
     assert ours is not None, "they are made to be seen"

@@ -159,6 +159,8 @@ def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: li
         ("here & (z < best), z, best", "here & (z < best), z.clamp(max=2.0), best", "filters"),
         ("camera.focal_x for camera", "camera.focal_y for camera", "filters"),
         ("found |= here", "found |= here & camera.sharp", "filters"),
+        ('print("Filters")', "self.count = len(cameras)", "filters"),
+        ("before = self.get_scaling ** 2", "before = self.kept = self.get_scaling ** 2", "opacities"),
         ("best[~found] = best[found].max()", "best[~found] = best[found].mean()", "filters"),
     ],
 )

@@ -16,6 +16,8 @@ from lapgs_plugin.runner import checkout_noise
 LOOP = """
 import torch
 
+ONE = 1
+
 def matrices(s, q):
     q = q / q.norm(dim=1, keepdim=True)
     v, w = q[:, 1:], q[:, :1]
@@ -116,6 +118,7 @@ def test_where_the_share_is_defined(load_module: Callable[[str], ModuleType], sh
         ("1 - model.get_opacity", "model.get_opacity"),
         ("fade(1 - model.get_opacity)", "fade(1 - model.get_opacity, 50)"),
         ("k=100", "k=50"),
+        ("torch.exp(k *", "torch.exp(ONE * k *"),
         ("x0=0.995", "x0=0.99"),
         ("* s[:, None, :]", "* s[:, :, None]"),
         ("args.lr * rate", "args.lr * torch.tensor(rate)"),
