@@ -24,7 +24,6 @@ from lapgs_plugin.ops import smoothing_filter
 from lapgs_plugin.ops.self_check import SelfCheck, largest
 from lapgs_plugin.ops.smoothing_filter.in_torch import CameraRow, seen_from
 from lapgs_plugin.ops.smoothing_filter.in_torch import gaussians as examples
-from lapgs_plugin.runner.model_tensors import ACTIVATIONS, has_activations, is_rows
 
 FILTERS = "filter_3D"
 """Attribute of models with filters: (n, 1) standard deviations."""
@@ -32,6 +31,8 @@ SCALES, OPACITIES = "get_scaling_with_3D_filter", "get_opacity_with_3D_filter"
 """Their properties that renderers read."""
 COMPUTE = "compute_3D_filter"
 """Their method that makes the filters, of a list of cameras."""
+ACTIVATIONS = {"scaling_activation": torch.exp, "opacity_activation": torch.sigmoid}
+"""Functions that a model's properties have to use."""
 VARIANCE = 0.2
 """Variance of a filter in pixels of the camera with the largest focal length."""
 LARGEST_DIFFERENCE = 1e-4
@@ -74,7 +75,7 @@ def computing(original: Callable[..., Any]) -> Callable[..., Any]:
     def compute(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
         means: Any = getattr(gaussians, "_xyz", None)
         cameras = [*args, *kwargs.values()]
-        if len(cameras) == 1 and is_rows(means, 3) and _has_kernels(means) and agrees(means.device):
+        if len(cameras) == 1 and _is_rows(means, 3) and _has_kernels(means) and agrees(means.device):
             filters = _filters(means.detach(), cameras[0])
             if filters is not None:
                 print("".join(said), end="")
@@ -132,14 +133,20 @@ def _rows(cameras: Any) -> list[CameraRow]:
 
 def _fits(gaussians: Any) -> bool:
     """Return whether our operations take a model's tensors in the place of its properties."""
-    if not has_activations(gaussians):
+    if any(getattr(gaussians, name, None) is not function for name, function in ACTIVATIONS.items()):
         return False
     filters: Any = getattr(gaussians, FILTERS, None)
     log_scales, logits = gaussians._scaling, gaussians._opacity
-    if not (is_rows(log_scales, 3) and is_rows(logits, 1) and is_rows(filters, 1)):
+    if not (_is_rows(log_scales, 3) and _is_rows(logits, 1) and _is_rows(filters, 1)):
         return False
     fit = len(log_scales) == len(logits) and len(filters) in (1, len(logits)) and not filters.requires_grad
     return fit and log_scales.device == logits.device == filters.device
+
+
+def _is_rows(value: Any, columns: int) -> bool:
+    """Return whether a value is one that kernels read: contiguous rows of float32."""
+    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
+    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
 
 
 def _has_kernels(tensor: Tensor) -> bool:

@@ -21,7 +21,6 @@ from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS
 from lapgs_plugin.ops.scaled_rotations import examples
 from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
 from lapgs_plugin.ops.self_check import SelfCheck, largest
-from lapgs_plugin.runner.model_tensors import is_rows
 
 LARGEST_DIFFERENCE = 1e-4
 """Largest difference of scaled rotations, for scales below 4, and of the noise's share that counts as rounding."""
@@ -46,14 +45,14 @@ def _shake(build: Any, fading: Any, model: Any, *factors: Any) -> bool:
         factors: numbers.
     """
     means: Any = getattr(model, "_xyz", None)
-    if torch.is_grad_enabled() or not is_rows(means, 3) or not _has_kernels(means):
+    if torch.is_grad_enabled() or not _is_rows(means, 3) or not _has_kernels(means):
         return False
     if not all(isinstance(factor, (int, float)) for factor in factors) or not _agree(build, fading, means.device):
         return False
     tensors = model.get_scaling, model.get_rotation, model.get_opacity
     n, device = len(means), means.device
     if not all(
-        is_rows(tensor, columns) and len(tensor) == n and tensor.device == device
+        _is_rows(tensor, columns) and len(tensor) == n and tensor.device == device
         for tensor, columns in zip(tensors, (3, 4, 1), strict=True)
     ):
         return False
@@ -62,6 +61,12 @@ def _shake(build: Any, fading: Any, model: Any, *factors: Any) -> bool:
         amount *= float(factor)
     position_noise.shake(means, torch.randn_like(means), *tensors, amount)
     return True
+
+
+def _is_rows(value: Any, columns: int) -> bool:
+    """Return whether a value is one that kernels read: contiguous rows of float32."""
+    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
+    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
 
 
 def _has_kernels(means: Tensor) -> bool:

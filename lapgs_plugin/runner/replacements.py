@@ -15,13 +15,7 @@ from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.checkouts.syntax import called_methods, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import (
-    checkout_filters,
-    checkout_loss,
-    checkout_noise,
-    checkout_regularizers,
-    checkout_rotations,
-)
+from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_noise, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.kept_memory import keeping_memory
@@ -172,7 +166,7 @@ class StageReplacements:
         changed = original if rows is None else rows.updating(reading_late(original))
         if self._context.request.settings.fused_ssim:
             changed = checkout_loss.in_one_kernel(changed)
-        changed = checkout_regularizers.in_one_kernel(checkout_noise.in_one_kernel(changed))
+        changed = checkout_noise.in_one_kernel(changed)
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:

@@ -410,22 +410,6 @@ for n in (1, 700):
     shake_triton(means, noise, scales, quaternions, opacities, 0.7)
     torch.testing.assert_close(means.double(), expected, rtol=0, atol=2e-6)
 """
-REGULARIZED = """
-import torch
-from lapgs_plugin.ops.regularization.in_torch import regularized_torch
-from lapgs_plugin.ops.regularization.in_triton import regularized_triton
-torch.set_default_device(DEVICE)
-torch.manual_seed(0)
-for n in (1, 511, 1500):
-    results = []
-    values = torch.tensor(0.7), torch.randn(n, 1), torch.randn(n, 3)
-    for version, kind in ((regularized_triton, torch.float32), (regularized_torch, torch.float64)):
-        leaves = [value.to(kind, copy=True).requires_grad_() for value in values]
-        loss = version(*leaves, 0.3, 0.2)
-        results.append([loss, *torch.autograd.grad(n * loss, leaves)])
-    for one, other in zip(*results):
-        torch.testing.assert_close(one.double(), other, rtol=1e-5, atol=1e-6)
-"""
 COMPILED_ROWS = """
 import torch
 import triton
@@ -453,19 +437,8 @@ assert "mul.f32" in assembly[0] and "add.f32" in assembly[0] and "sqrt.rn.f32" i
 assert "fma" not in assembly[0]
 """
 
-NAMES = [
-    "all",
-    "noise",
-    "upsample",
-    "rows",
-    "quaternions",
-    "rotations",
-    "grids",
-    "filters",
-    "given noise",
-    "regularized",
-]
-ALONE = [ROWS, QUATERNIONS, ROTATIONS, GRIDS, FILTERS, GIVEN_NOISE, REGULARIZED]
+NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations", "grids", "filters", "given noise"]
+ALONE = [ROWS, QUATERNIONS, ROTATIONS, GRIDS, FILTERS, GIVEN_NOISE]
 
 
 def run_checks(checks: str, device: str, **environment: str) -> None:

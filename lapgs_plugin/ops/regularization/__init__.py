@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch, regularized_torch
+from lapgs_plugin.ops.regularization.in_torch import add_regularization_torch
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
@@ -53,36 +53,3 @@ def triton_works(device: torch.device) -> float:
     term = 300.0 * logits.sigmoid().mean() + 200.0 * log_scales.exp().mean()
     expected = [added + begun for added, begun in zip(torch.autograd.grad(term, leaves), before, strict=True)]
     return largest((one - other).abs() / other.abs().max() for one, other in zip(gradients, expected, strict=True))
-
-
-def regularized(
-    loss: Tensor, opacity_logits: Tensor, log_scales: Tensor, opacity_weight: float, scale_weight: float
-) -> Tensor:
-    """Return a loss () with the weighted sum of the mean opacity and the mean size, differentiable once by kernels.
-
-    Args:
-        opacity_logits: (n, 1) contiguous, n above 0.
-        log_scales: (n, 3) contiguous.
-    """
-    arguments = loss, opacity_logits, log_scales
-    if loss_works(*arguments):
-        from lapgs_plugin.ops.regularization.in_triton import regularized_triton
-
-        return regularized_triton(*arguments, opacity_weight, scale_weight)
-    return regularized_torch(*arguments, opacity_weight, scale_weight)
-
-
-@matches_reference("regularization of a loss in several operations instead of one kernel", 1e-5)
-def loss_works(device: torch.device) -> float:
-    """Compare the loss, and gradients relative to the largest."""
-    from lapgs_plugin.ops.regularization.in_triton import regularized_triton
-
-    generator = torch.Generator().manual_seed(0)
-    values = [torch.randn(700, columns, generator=generator).to(device) for columns in (1, 3)]
-    results = []
-    for version in (regularized_triton, regularized_torch):
-        leaves = [torch.ones((), device=device), *values]
-        leaves = [leaf.clone().requires_grad_() for leaf in leaves]
-        loss = version(leaves[0], leaves[1], leaves[2], 0.3, 0.2)
-        results.append((loss, *torch.autograd.grad(2.0 * loss, leaves)))
-    return largest((one - other).abs().max() / other.abs().max() for one, other in zip(*results, strict=True))

@@ -1,4 +1,4 @@
-"""Compute regularization, or its gradients alone, in PyTorch's operations."""
+"""Compute the gradients of regularization in PyTorch's operations."""
 
 from __future__ import annotations
 
@@ -16,11 +16,3 @@ def add_regularization_torch(
         by_logits.addcmul_(opacities, 1 - opacities, value=opacity_weight / opacity_logits.numel())
     if scale_weight:
         by_log_scales.add_(torch.exp(log_scales), alpha=scale_weight / log_scales.numel())
-
-
-def regularized_torch(
-    loss: Tensor, opacity_logits: Tensor, log_scales: Tensor, opacity_weight: float, scale_weight: float
-) -> Tensor:
-    """Do `regularized` in PyTorch's operations, on any device."""
-    term = opacity_weight * torch.sigmoid(opacity_logits).mean()
-    return loss + (term + scale_weight * torch.exp(log_scales).mean())
