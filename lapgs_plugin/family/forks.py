@@ -189,7 +189,7 @@ _arriving: deque[tuple[Any, Tensor]] = deque()
 
 def _require_no_offset(settings: Any) -> None:
     """Refuse pixels that are moved; on a GPU a few calls later, because asking it at once would wait for it."""
-    moved = (settings.subpixel_offset != 0).any()
+    moved = settings.subpixel_offset.any()
     if moved.is_cuda:
         flag = torch.empty((), dtype=torch.bool, pin_memory=True)
         event: Any = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's

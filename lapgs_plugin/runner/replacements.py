@@ -15,9 +15,10 @@ from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.checkouts.syntax import called_methods, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.runner import checkout_loss, checkout_rotations
+from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_noise, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
+from lapgs_plugin.runner.kept_memory import keeping_memory
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.step_clock import timing_replacements
 from lapgs_plugin.runner.visible_rows import VisibleRows
@@ -77,6 +78,8 @@ class StageReplacements:
             *self._in_losses(profile),
             *self._in_reports(profile),
             *self._in_rotations(profile),
+            *self._in_freeing(profile),
+            *checkout_filters.replacements(profile.model, "training() when it renders and densifies"),
             *parts.replacements(profile, adapter.info),
         ]
 
@@ -148,12 +151,22 @@ class StageReplacements:
         replacement = Replacement(script, name, checkout_rotations.in_our_kernel, "training() in its noise")
         return [replacement] if inspect.isfunction(vars(script).get(name)) else []
 
+    @staticmethod
+    def _in_freeing(profile: Profile) -> list[Replacement]:
+        """Return replacements of the model's methods that give unused GPU memory back, so that some is kept."""
+        return [
+            replacement
+            for name in profile.freeing
+            for replacement in of_class(profile.model, name, keeping_memory, "training() when it densifies")
+        ]
+
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
         rows = self._context.wrapper.rows
         changed = original if rows is None else rows.updating(reading_late(original))
         if self._context.request.settings.fused_ssim:
             changed = checkout_loss.in_one_kernel(changed)
+        changed = checkout_noise.in_one_kernel(changed)
 
         @wraps(original)
         def training(*args: Any, **kwargs: Any) -> Any:

@@ -282,9 +282,11 @@ for n in (1, 511, 1500):
     cases = [
         (True, rows), (False, 1), (True, 0.1), (False, whole), (False, rows, None, whole),
         (False, wide, (None, 2)), (True, wide, (2, None), rows), (False, wide, (2, 4), whole),
+        (True, wide, (3, None)),
     ]
     plain = [*cases[:5], (False, first), (True, last, None, rows), (False, last, None, whole)]
-    targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(8)]
+    plain.append((True, wide[:, 3:].abs()))
+    targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(9)]
                          for _ in range(2))
     update_rows_triton(mask, [Update(target, *case) for target, case in zip(targets, cases)])
     for target, case in zip(expected, plain):
@@ -365,6 +367,49 @@ if DEVICE == "cuda":
     from lapgs_plugin.ops.bilateral_grid import triton_works
     assert triton_works.passes_on(torch.device("cuda"))
 """
+FILTERS = """
+import torch
+from lapgs_plugin.ops.smoothing_filter import in_torch, in_triton
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+kinds = (
+    (in_triton.filtered_scales_triton, in_torch.filtered_scales_torch, 1),
+    (in_triton.filtered_opacities_triton, in_torch.filtered_opacities_torch, 0),
+)
+for n in (1, 700):
+    tensors, filters = (2 * torch.randn(n, 1), torch.randn(n, 3) - 1), torch.rand(n, 1)
+    filters[::7] = 0.0
+    for ours, reference, first in kinds:
+        results, weights = [], torch.randn_like(tensors[first])
+        for version, kind in ((ours, torch.float32), (reference, torch.float64)):
+            leaves = [tensor.to(kind, copy=True).requires_grad_() for tensor in tensors[first:]]
+            output = version(*leaves, filters.to(kind))
+            results.append([output, *torch.autograd.grad((output * weights).sum(), leaves)])
+        for one, other in zip(*results):
+            torch.testing.assert_close(one.double(), other, rtol=2e-5, atol=1e-6)
+means, cameras = in_torch.seen_from(DEVICE)
+means[0], means[1, 2] = torch.nan, torch.inf
+depths, expected = in_triton.nearest_depths_triton(means, cameras), in_torch.nearest_depths_torch(means, cameras)
+assert torch.equal(depths.isinf(), expected.isinf()) and 0.3 < depths.isinf().float().mean() < 0.7
+torch.testing.assert_close(depths, expected, rtol=1e-5, atol=1e-6)
+"""
+GIVEN_NOISE = """
+import torch
+from lapgs_plugin.ops.position_noise.in_triton import shake_triton
+from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
+torch.set_default_device(DEVICE)
+torch.manual_seed(0)
+for n in (1, 700):
+    means, noise, quaternions = torch.randn(n, 3), torch.randn(n, 3), torch.randn(n, 4)
+    scales, opacities = torch.rand(n, 3), 0.1 * torch.rand(n, 1)
+    opacities[::5] = 1.0
+    matrices = scaled_rotations_torch(scales.double(), quaternions.double())
+    share = 0.7 * torch.sigmoid(100 * (0.005 - opacities.double()))
+    moved = (matrices @ matrices.mT @ (noise.double() * share)[:, :, None])[:, :, 0]
+    expected = means.double() + moved
+    shake_triton(means, noise, scales, quaternions, opacities, 0.7)
+    torch.testing.assert_close(means.double(), expected, rtol=0, atol=2e-6)
+"""
 COMPILED_ROWS = """
 import torch
 import triton
@@ -392,7 +437,8 @@ assert "mul.f32" in assembly[0] and "add.f32" in assembly[0] and "sqrt.rn.f32" i
 assert "fma" not in assembly[0]
 """
 
-NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations", "grids"]
+NAMES = ["all", "noise", "upsample", "rows", "quaternions", "rotations", "grids", "filters", "given noise"]
+ALONE = [ROWS, QUATERNIONS, ROTATIONS, GRIDS, FILTERS, GIVEN_NOISE]
 
 
 def run_checks(checks: str, device: str, **environment: str) -> None:
@@ -402,7 +448,7 @@ def run_checks(checks: str, device: str, **environment: str) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only")
-@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, ROWS, QUATERNIONS, ROTATIONS, GRIDS], ids=NAMES)
+@pytest.mark.parametrize("checks", [CHECKS, NOISE, UPSAMPLE, *ALONE], ids=NAMES)
 def test_interpreted(checks: str) -> None:
     run_checks(checks, "cpu", TRITON_INTERPRET="1")
 
@@ -414,6 +460,6 @@ def test_products_of_rows_are_rounded_by_themselves(tmp_path: Path) -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("checks", [CHECKS, ROWS, QUATERNIONS, ROTATIONS, GRIDS], ids=["all", *NAMES[3:]])
+@pytest.mark.parametrize("checks", [CHECKS, *ALONE], ids=["all", *NAMES[3:]])
 def test_compiled(checks: str) -> None:
     run_checks(checks, "cuda")

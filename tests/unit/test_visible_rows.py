@@ -143,10 +143,11 @@ def test_values_of_any_kind(drawn: tuple[Any, Any, Any]) -> None:
             value = source if isinstance(source, (int, float)) else source[mask]
             plain[mask] = torch.max(plain[mask], value) if takes_largest else plain[mask] + value
             torch.testing.assert_close(ours, plain, rtol=0, atol=0, equal_nan=True)
-    ours, plain = (before.reshape(-1, 1).clone() for _ in range(2))
-    assert update_rows(mask, [Update(ours, False, points, (None, 2))])
-    plain[mask] += torch.norm(points[mask, :2], dim=-1, keepdim=True)
-    torch.testing.assert_close(ours, plain, rtol=0, atol=0, equal_nan=True)
+    for first, last in ((None, 2), (3, None)):
+        ours, plain = (before.reshape(-1, 1).clone() for _ in range(2))
+        assert update_rows(mask, [Update(ours, False, points, (first, last))])
+        plain[mask] += torch.norm(points[mask, first:last], dim=-1, keepdim=True)
+        torch.testing.assert_close(ours, plain, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("kind", ["indices", "column", "uint8", "float64", "strided"])

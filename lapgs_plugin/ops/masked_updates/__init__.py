@@ -51,7 +51,7 @@ def _fits(update: Update, mask: Tensor) -> bool:
         and source.dtype is torch.float32
         and source.ndim == target.ndim == 2
         and len(source) == n
-        and len(update.read_columns) == 2
+        and 1 <= len(update.read_columns) <= 2
     )
 
 
@@ -89,7 +89,7 @@ def triton_works(device: torch.device) -> float:
     mask, radii = rows[:, 0] > 0.2, (100 * rows[:, 0]).int()
     both = []
     for update in (update_rows_torch, update_rows_triton):
-        targets = [rows[:, 0].clone(), *(rows.clone() for _ in range(5))]
+        targets = [rows[:, 0].clone(), *(rows.clone() for _ in range(6))]
         updates = [
             Update(targets[0], True, radii),
             Update(targets[1], False, 1),
@@ -97,6 +97,7 @@ def triton_works(device: torch.device) -> float:
             Update(targets[3], False, points, (2, None), rows),
             Update(targets[4], True, points, (2, None)),
             Update(targets[5], False, rows, None, rows),
+            Update(targets[6], True, points, (3, None)),
         ]
         update(mask, updates)
         both.append(targets)

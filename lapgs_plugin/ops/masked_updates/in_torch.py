@@ -12,13 +12,13 @@ from torch import Tensor
 class Update(NamedTuple):
     """Describe an update of rows: the largest, or the sum, of what is there and a value.
 
-    The value of a row is that of a source, or the norm of two columns of it, and may be multiplied by a factor.
+    The value of a row is that of a source, or the norm of one or two columns of it, and may be multiplied by a factor.
 
     Attributes:
         target: (n,) or (n, 1) contiguous float32.
         takes_largest: whether the larger one stays, NaN if one of them is; they are added otherwise.
         source: contiguous float32 or int32 of the target's shape, or a number; (n, c) float32 if there are columns.
-        columns: bounds of the slice of two columns; None if the source is the value.
+        columns: bounds of the slice of one or two columns; None if the source is the value.
         factor: contiguous float32 or int32 of the target's shape; None for 1.
     """
 

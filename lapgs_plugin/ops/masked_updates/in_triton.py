@@ -23,7 +23,8 @@ MOST = 3
 @triton.jit
 def _update(
     target: tl.tensor, source: tl.tensor, factor: tl.tensor, rows: tl.tensor, shown: tl.tensor, zero: tl.tensor,
-    takes_largest: tl.constexpr, number: tl.constexpr, first: tl.constexpr, stride: tl.constexpr, times: tl.constexpr,
+    takes_largest: tl.constexpr, number: tl.constexpr, first: tl.constexpr, last: tl.constexpr, stride: tl.constexpr,
+    times: tl.constexpr,
 ) -> None:  # fmt: skip
     """Update the rows that are shown; rounding is that of PyTorch's single operations."""
     before = tl.load(target + rows, shown, 0.0)
@@ -31,9 +32,11 @@ def _update(
         value = tl.full(rows.shape, number, tl.float32)
     elif stride == ROWS:
         value = tl.load(source + rows, shown, 0).to(tl.float32)
+    elif first == last:
+        value = tl.abs(tl.load(source + stride * rows.to(tl.int64) + first, shown, 0.0))
     else:
         x = tl.load(source + stride * rows.to(tl.int64) + first, shown, 0.0)
-        y = tl.load(source + stride * rows.to(tl.int64) + first + 1, shown, 0.0)
+        y = tl.load(source + stride * rows.to(tl.int64) + last, shown, 0.0)
         value = tl.sqrt_rn(_product(x, x, zero) + _product(y, y, zero))
     if times:
         value = _product(value, tl.load(factor + rows, shown, 0).to(tl.float32), zero)
@@ -59,18 +62,21 @@ def _kernel(
     target2: tl.tensor, source2: tl.tensor, factor2: tl.tensor,
     n: int, zero: int,
     count: tl.constexpr,
-    largest0: tl.constexpr, number0: tl.constexpr, first0: tl.constexpr, stride0: tl.constexpr, times0: tl.constexpr,
-    largest1: tl.constexpr, number1: tl.constexpr, first1: tl.constexpr, stride1: tl.constexpr, times1: tl.constexpr,
-    largest2: tl.constexpr, number2: tl.constexpr, first2: tl.constexpr, stride2: tl.constexpr, times2: tl.constexpr,
+    largest0: tl.constexpr, number0: tl.constexpr, first0: tl.constexpr, last0: tl.constexpr,
+    stride0: tl.constexpr, times0: tl.constexpr,
+    largest1: tl.constexpr, number1: tl.constexpr, first1: tl.constexpr, last1: tl.constexpr,
+    stride1: tl.constexpr, times1: tl.constexpr,
+    largest2: tl.constexpr, number2: tl.constexpr, first2: tl.constexpr, last2: tl.constexpr,
+    stride2: tl.constexpr, times2: tl.constexpr,
     block: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     shown = (rows < n) & (tl.load(mask + rows, rows < n, 0) != 0)
-    _update(target0, source0, factor0, rows, shown, zero, largest0, number0, first0, stride0, times0)
+    _update(target0, source0, factor0, rows, shown, zero, largest0, number0, first0, last0, stride0, times0)
     if count > 1:
-        _update(target1, source1, factor1, rows, shown, zero, largest1, number1, first1, stride1, times1)
+        _update(target1, source1, factor1, rows, shown, zero, largest1, number1, first1, last1, stride1, times1)
     if count > 2:
-        _update(target2, source2, factor2, rows, shown, zero, largest2, number2, first2, stride2, times2)
+        _update(target2, source2, factor2, rows, shown, zero, largest2, number2, first2, last2, stride2, times2)
 
 
 def update_rows_triton(mask: Tensor, updates: Sequence[Update]) -> None:
@@ -83,13 +89,14 @@ def _launch(mask: Tensor, updates: Sequence[Update]) -> None:
     tensors: list[Tensor] = [mask]
     kinds = []
     for update in updates:
-        target, takes_largest, source, columns, factor = update
+        target, takes_largest, source, bounds, factor = update
         if not isinstance(source, Tensor):
-            kind = takes_largest, float(source), 0, NUMBER.value, False
-        elif columns is None:
-            kind = takes_largest, 0.0, 0, ROWS.value, factor is not None
+            kind = takes_largest, float(source), 0, 0, NUMBER.value, False
+        elif bounds is None:
+            kind = takes_largest, 0.0, 0, 0, ROWS.value, factor is not None
         else:
-            kind = takes_largest, 0.0, update.read_columns[0], source.shape[1], factor is not None
+            columns = update.read_columns
+            kind = takes_largest, 0.0, columns[0], columns[-1], source.shape[1], factor is not None
         kinds.append(kind)
         # What a kernel does not read is any tensor.
         tensors += target, source if isinstance(source, Tensor) else target, target if factor is None else factor
@@ -102,9 +109,9 @@ def _launch(mask: Tensor, updates: Sequence[Update]) -> None:
 def _constants(kinds: tuple[tuple[Any, ...], ...]) -> dict[str, Any]:
     """Return the constants of a kernel by name."""
     constants: dict[str, Any] = {"count": len(kinds)}
-    for i, kind in enumerate((*kinds, *[(False, 0.0, 0, ROWS.value, False)] * (MOST - len(kinds)))):
+    for i, kind in enumerate((*kinds, *[(False, 0.0, 0, 0, ROWS.value, False)] * (MOST - len(kinds)))):
         constants |= {
             f"{name}{i}": value
-            for name, value in zip(("largest", "number", "first", "stride", "times"), kind, strict=True)
+            for name, value in zip(("largest", "number", "first", "last", "stride", "times"), kind, strict=True)
         }
     return constants

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS, displacements
+from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS, displacements, shaken
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 
@@ -20,6 +20,40 @@ def add_noise(means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_lo
         add_noise_triton(means, quaternions, log_scales, opacity_logits, amount, seed)
     else:
         means += displacements(quaternions, log_scales, opacity_logits, torch.randn_like(means), amount)
+
+
+@torch.no_grad()
+def shake(means: Tensor, noise: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, amount: float) -> None:
+    """Move means (n, 3) by `shaken` of noise that was drawn before, in place.
+
+    Args:
+        means, noise: (n, 3) contiguous.
+        scales: (n, 3) contiguous.
+        quaternions: (n, 4) contiguous, w first and of any length.
+        opacities: (n, 1) contiguous.
+        amount: factor for a transparent Gaussian.
+    """
+    tensors = noise, scales, quaternions, opacities
+    if len(means) > 0 and given_noise_works(means, *tensors):
+        from lapgs_plugin.ops.position_noise.in_triton import shake_triton
+
+        shake_triton(means, *tensors, amount)
+    else:
+        means += shaken(*tensors, amount)
+
+
+@matches_reference("noise of positions in several operations instead of one kernel", 1e-5)
+def given_noise_works(device: torch.device) -> float:
+    """Compare how far some Gaussians move, relative to the farthest."""
+    from lapgs_plugin.ops.position_noise.in_triton import shake_triton
+
+    generator = torch.Generator().manual_seed(0)
+    noise, scales = (torch.randn(300, 3, generator=generator).to(device) for _ in range(2))
+    quaternions = torch.randn(300, 4, generator=generator).to(device)
+    opacities, moved = torch.linspace(0.0, 0.1, 300, device=device)[:, None], torch.zeros_like(noise)
+    expected = shaken(noise, scales.exp(), quaternions, opacities, 0.5)
+    shake_triton(moved, noise, scales.exp(), quaternions, opacities, 0.5)
+    return largest([(moved - expected).abs() / expected.abs().max()])
 
 
 @matches_reference("noise of positions in several operations instead of one kernel", 1e-5)

@@ -26,6 +26,13 @@ def displacements(
     return _turned(quaternions, along * torch.exp(2.0 * log_scales))
 
 
+def shaken(noise: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, amount: float) -> Tensor:
+    """Return `displacements` of Gaussians whose scales (n, 3) and opacities (n, 1) are given themselves."""
+    share = torch.sigmoid(SHARPNESS * ((1.0 - opacities) - (1.0 - FAINT)))
+    along = _turned(quaternions, noise * (amount * share), back=True)
+    return _turned(quaternions, along * scales.square())
+
+
 def _turned(quaternions: Tensor, vectors: Tensor, *, back: bool = False) -> Tensor:
     """Rotate vectors (n, 3) by quaternions (n, 4), or back; matrices would take three times the memory."""
     real, axis = quaternions[:, :1], quaternions[:, 1:]

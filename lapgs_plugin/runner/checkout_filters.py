@@ -1,0 +1,219 @@
+"""Filter a checkout's Gaussians in space by our kernels, where its own model does the same.
+
+Its properties take 55 launches an iteration with their gradients. Filters themselves are made by a loop over all
+cameras, with some 35 launches and five waits for each.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from functools import cache, partial, wraps
+from inspect import getattr_static
+from types import FunctionType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lapgs_plugin.checkouts.attachment import Replacement, of_class
+from lapgs_plugin.ops import smoothing_filter
+from lapgs_plugin.ops.self_check import SelfCheck, largest
+from lapgs_plugin.ops.smoothing_filter.in_torch import CameraRow, seen_from
+from lapgs_plugin.ops.smoothing_filter.in_torch import gaussians as examples
+
+FILTERS = "filter_3D"
+"""Attribute of models with filters: (n, 1) standard deviations."""
+SCALES, OPACITIES = "get_scaling_with_3D_filter", "get_opacity_with_3D_filter"
+"""Their properties that renderers read."""
+COMPUTE = "compute_3D_filter"
+"""Their method that makes the filters, of a list of cameras."""
+ACTIVATIONS = {"scaling_activation": torch.exp, "opacity_activation": torch.sigmoid}
+"""Functions that a model's properties have to use."""
+VARIANCE = 0.2
+"""Variance of a filter in pixels of the camera with the largest focal length."""
+LARGEST_DIFFERENCE = 1e-4
+"""Largest difference from the checkout's results, relative to the largest of them, that counts as rounding."""
+
+
+def replacements(model: type, consumer: str) -> list[Replacement]:
+    """Return the replacements in a class of models; none if it has no filters."""
+    makers: dict[str, Callable[[Any], Any]] = {
+        SCALES: lambda original: _property(model, original, _our_scales),
+        OPACITIES: lambda original: _property(model, original, _our_opacities),
+        COMPUTE: computing,
+    }
+    found = [replacement for name, make in makers.items() for replacement in of_class(model, name, make, consumer)]
+    return [r for r in found if isinstance(vars(r.owner)[r.name], FunctionType if r.name == COMPUTE else property)]
+
+
+def _property(model: type, original: property, ours: Callable[[Any], Tensor]) -> property:
+    """Return the replacement of a property of models; where it differs from ours, it is read itself."""
+    getter = original.fget
+    assert getter is not None, "properties of the family are read"
+    name = f"{getter.__module__}.{getter.__qualname__} of the checkout"
+    agrees = cache(SelfCheck(partial(_property_difference, model, getter, ours), name, LARGEST_DIFFERENCE).passes_on)
+
+    @wraps(getter)
+    def read(gaussians: Any) -> Any:
+        suits = _fits(gaussians) and _has_kernels(gaussians._scaling) and agrees(gaussians._scaling.device)
+        return ours(gaussians) if suits else getter(gaussians)
+
+    return property(read, original.fset, original.fdel, original.__doc__)
+
+
+def computing(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the replacement of a method that makes filters, of one argument; where it differs, it is called itself."""
+    name = f"{original.__module__}.{original.__qualname__} of the checkout"
+    said = list[str]()  # by the checkout's method, which may tell that it is called
+    agrees = cache(SelfCheck(partial(_filter_difference, original, said), name, LARGEST_DIFFERENCE).passes_on)
+
+    @wraps(original)
+    def compute(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+        means: Any = getattr(gaussians, "_xyz", None)
+        cameras = [*args, *kwargs.values()]
+        if len(cameras) == 1 and _is_rows(means, 3) and _has_kernels(means) and agrees(means.device):
+            filters = _filters(means.detach(), cameras[0])
+            if filters is not None:
+                print("".join(said), end="")
+                setattr(gaussians, FILTERS, filters)
+                return None
+        return original(gaussians, *args, **kwargs)
+
+    return compute
+
+
+def _our_scales(gaussians: Any) -> Tensor:
+    return smoothing_filter.filtered_scales(gaussians._scaling, _filters_of(gaussians))
+
+
+def _our_opacities(gaussians: Any) -> Tensor:
+    return smoothing_filter.filtered_opacities(gaussians._opacity, gaussians._scaling, _filters_of(gaussians))
+
+
+def _filters_of(gaussians: Any) -> Tensor:
+    """Return a model's filters, one for each Gaussian; models of archived fields have one for all."""
+    filters: Tensor = getattr(gaussians, FILTERS)
+    return filters.expand(len(gaussians._scaling), 1).contiguous()
+
+
+@torch.no_grad()
+def _filters(means: Tensor, cameras: Any) -> Tensor | None:
+    """Return filters (n, 1) of centres (n, 3); None if cameras are not as expected, or see none of them."""
+    rows = _rows(cameras)
+    if not rows:
+        return None
+    table = torch.tensor([row.numbers for row in rows], dtype=torch.float32)
+    depths = smoothing_filter.nearest_depths(means.contiguous(), table.to(means.device))
+    seen = depths < torch.inf
+    if not bool(seen.any()):
+        return None
+    depths = torch.where(seen, depths, torch.where(seen, depths, 0.0).amax())
+    filters: Tensor = depths / max(row.focal[0] for row in rows) * VARIANCE**0.5
+    return filters[:, None]
+
+
+def _rows(cameras: Any) -> list[CameraRow]:
+    """Return the numbers of cameras; none if one of them has others than the family's."""
+    rows = []
+    for camera in cameras if isinstance(cameras, Sequence) else ():
+        numbers = [getattr(camera, name, None) for name in ("focal_x", "focal_y", "image_width", "image_height")]
+        matrix, shift = getattr(camera, "R", None), getattr(camera, "T", None)
+        if not (isinstance(matrix, np.ndarray) and isinstance(shift, np.ndarray)) or None in numbers:
+            return []
+        if (matrix.shape, shift.shape) != ((3, 3), (3,)):
+            return []
+        fx, fy, width, height = map(float, numbers)  # type: ignore[arg-type]  # None is not among them
+        rows.append(CameraRow(tuple(matrix.ravel().tolist()), tuple(shift.tolist()), (fx, fy), (width, height)))
+    return rows
+
+
+def _fits(gaussians: Any) -> bool:
+    """Return whether our operations take a model's tensors in the place of its properties."""
+    if any(getattr(gaussians, name, None) is not function for name, function in ACTIVATIONS.items()):
+        return False
+    filters: Any = getattr(gaussians, FILTERS, None)
+    log_scales, logits = gaussians._scaling, gaussians._opacity
+    if not (_is_rows(log_scales, 3) and _is_rows(logits, 1) and _is_rows(filters, 1)):
+        return False
+    fit = len(log_scales) == len(logits) and len(filters) in (1, len(logits)) and not filters.requires_grad
+    return fit and log_scales.device == logits.device == filters.device
+
+
+def _is_rows(value: Any, columns: int) -> bool:
+    """Return whether a value is one that kernels read: contiguous rows of float32."""
+    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
+    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
+
+
+def _has_kernels(tensor: Tensor) -> bool:
+    """Return whether kernels compute with a tensor; on a CPU the checkout's own operations do."""
+    return smoothing_filter.triton_works(tensor)
+
+
+def _property_difference(
+    model: type, getter: Callable[[Any], Any], ours: Callable[[Any], Tensor], device: torch.device
+) -> float:
+    """Return how far a property is from ours for some Gaussians, and its gradients.
+
+    It is read of an object that has its class's activations and nothing else.
+    """
+    names = "get_scaling", "get_opacity"
+    own = {name: getattr_static(model, name) for name in names if hasattr(model, name)}
+    logits, log_scales, filters = examples(device)
+    weights = torch.cos(torch.arange(len(logits), device=device))[:, None]
+    results = []
+    for read in (ours, getter):
+        probe = type("Probe", (), own)()
+        leaves = [value.clone().requires_grad_() for value in (logits, log_scales)]
+        vars(probe).update({"_opacity": leaves[0], "_scaling": leaves[1], FILTERS: filters, **ACTIVATIONS})
+        before = set(vars(probe))
+        output = read(probe)
+        if set(vars(probe)) != before:
+            return math.inf  # it does more
+        gradients = torch.autograd.grad((output * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
+        results.append((output, *gradients))
+    return largest(map(_apart, *results))
+
+
+def _filter_difference(original: Callable[..., Any], said: list[str], device: torch.device) -> float:
+    """Return how far filters are from ours for some centres and cameras, and note what is printed meanwhile."""
+    means, rows = seen_from(device)
+    cameras = [_Camera.of(row) for row in rows.cpu().numpy().astype(np.float64)]
+    probe = SimpleNamespace(get_xyz=means, _xyz=means)
+    before = set(vars(probe))
+    with redirect_stdout(io.StringIO()) as text:
+        returned = original(probe, cameras)
+    if returned is not None or vars(probe).keys() != before | {FILTERS}:
+        return math.inf  # it does more
+    said[:] = [text.getvalue()]
+    ours = _filters(means, cameras)
+    assert ours is not None, "they are made to be seen"
+    return largest([_apart(ours, getattr(probe, FILTERS))])
+
+
+class _Camera(NamedTuple):
+    """Hold what a checkout's method needs of a camera; it cannot ask for more."""
+
+    R: Any
+    T: Any
+    focal_x: float
+    focal_y: float
+    image_width: int
+    image_height: int
+
+    @classmethod
+    def of(cls, row: Any) -> _Camera:
+        """Return the camera of a row of `nearest_depths`."""
+        fx, fy, width, height = row[12:]
+        return cls(row[:9].reshape(3, 3), row[9:12], float(fx), float(fy), int(width), int(height))
+
+
+def _apart(one: Tensor, other: Tensor) -> Tensor:
+    """Return the largest difference of two tensors, relative to the largest value; inf for other shapes."""
+    if one.shape != other.shape:
+        return one.new_tensor(torch.inf)
+    return (one - other).abs().max() / other.abs().max().clamp_min(1e-9)
