@@ -111,7 +111,9 @@ def _gaussians(source: CheckoutSource) -> str:
 
 def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
-    detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
+    detail = (
+        f"{use.where} imports it for {', '.join(use.functions)}; outputs: {len(use.outputs) or 1}; inputs: {inputs}"
+    )
     if use.module in source.modules:
         return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):
