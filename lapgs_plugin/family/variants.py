@@ -24,7 +24,9 @@ from functools import lru_cache
 from typing import Any
 
 from torch import Tensor
+from torch.nn.functional import interpolate
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family import forks
 from lapgs_plugin.family.binding import DcApart, Rasterizer, WholeSh
 from lapgs_plugin.family.call import SUMS, Options, Output
@@ -139,6 +141,21 @@ def _weight_rows(settings: Any) -> int:
     return 0 if settings.pixel_weights is None else len(settings.pixel_weights)
 
 
+def _weights(settings: Any) -> Tensor:
+    """Return the weights of the image's pixels, (height * width,).
+
+    DEPARTURE: those of an image of another size are resized, where the CUDA code reads whatever lies behind them. A
+    script that makes them once, at its start, has them of a coarser level.
+    """
+    weights: Tensor = settings.pixel_weights
+    size = int(settings.image_height), int(settings.image_width)
+    if weights.numel() == size[0] * size[1]:
+        return weights.reshape(-1)
+    if weights.ndim != 2:
+        raise UserInputError(f"pixel_weights is {tuple(weights.shape)}, expected {size}")
+    return interpolate(weights[None, None].float(), size, mode="bilinear").reshape(-1)
+
+
 _ANTIALIASED = Variant(
     "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
     (*_FAMILY, "antialiasing"),
@@ -163,7 +180,7 @@ BACKBONES = {
         (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
         options=lambda settings: (
-            Options(sums=SUMS, pixel_weights=settings.pixel_weights) if _weight_rows(settings) > 1 else Options()
+            Options(sums=SUMS, pixel_weights=_weights(settings)) if _weight_rows(settings) > 1 else Options()
         ),
         outputs=_with_sums,
         binding=DcApart,

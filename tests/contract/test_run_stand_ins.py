@@ -68,6 +68,16 @@ def test_a_fork_that_kept_a_file_is_recognised_by_what_it_renders_with(
     assert adapter_class(checkout).info.name == name
 
 
+def test_a_fork_that_kept_a_file_without_importing_it_is_not_its_source(tmp_path: Path) -> None:
+    """As a fork of Taming-3DGS that scores Gaussians in another way: nothing of that file is there to be replaced."""
+    checkout = changed(tmp_path)
+    (checkout / "utils" / "taming_utils.py").write_text("")
+    assert adapter_class(checkout).info.name == "graphdeco"
+    with (checkout / "train.py").open("a", encoding="utf-8") as script:
+        script.write("\nimport utils.taming_utils\n")
+    assert adapter_class(checkout).info.name == "taming"
+
+
 def test_a_fork_that_kept_filters_is_recognised_without_the_files_of_its_source(tmp_path: Path) -> None:
     """As a fork of Mip-Splatting that extracts meshes: its fields need the filters of its model applied."""
     checkout = changed(tmp_path, (BLUR, f"{BLUR}        kernel_size=0.1,\n"))

@@ -193,6 +193,22 @@ def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
     assert 0 < float(losses.sum()) < float((shares * loss.sum(0)).sum())
 
 
+def test_pixel_weights_of_another_level_are_resized() -> None:
+    """A script that finds the edges of all photos at its start has those of the coarsest level ever after."""
+    case, module = small_case(), module_of("taming")
+    sums = []
+    for size in ((41, 53), (21, 27), (41 * 53,), (7, 5, 3)):
+        weights = torch.full(size, 0.5)
+        if len(size) == 3:
+            with pytest.raises(UserInputError, match=r"pixel_weights is \(7, 5, 3\), expected \(41, 53\)"):
+                call(module, "taming", case, activated(case), pixel_weights=weights)
+        else:
+            sums.append(call(module, "taming", case, activated(case), pixel_weights=weights)[9])
+    assert float(sums[0].max()) > 0
+    for other in sums[1:]:
+        assert torch.allclose(other, sums[0], rtol=1e-5)
+
+
 def with_depths(name: str, case: Case, **settings: Any) -> tuple[list[Tensor], list[Tensor]]:
     """Return outputs of a variant, and gradients of the centres, opacities, SH and of `means2D` by all of them."""
     module = module_of(name)
