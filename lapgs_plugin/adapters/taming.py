@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lapgs_plugin.adapters.base import BackboneAdapter, logits_of
 from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.source import readable_source
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import UserInputError
 
@@ -26,6 +27,9 @@ BASE_SHARE = 0.5
 Gaussians."""
 FINEST_SHARE = 1.0
 """Share of the budget that the finest level ends with; levels between are interpolated."""
+
+SCORES = "utils.taming_utils"
+"""Module of a checkout that scores Gaussians."""
 
 LOW_LOGIT = -1.0
 """Value that tells logits from opacities in a PLY: a trained field has logits down to about -5.3 (opacity 0.005, where
@@ -48,6 +52,12 @@ class Adapter(BackboneAdapter):
     )
 
     @classmethod
+    def recognises(cls, folder: Path) -> bool:
+        """Return whether a folder is the root of its checkout; forks that score otherwise may have kept its file."""
+        source = readable_source(folder)
+        return super().recognises(folder) and (source is None or SCORES in source.modules)
+
+    @classmethod
     def saved_field(cls, path: Path) -> GaussianField:
         field = super().saved_field(path)
         stored = field.opacity_logits
@@ -60,9 +70,7 @@ class Adapter(BackboneAdapter):
         consumer = "densify_with_score(), which cannot sample nothing"
         model = self.profile.model
         return [
-            Replacement(
-                sys.modules["utils.taming_utils"], "get_loss_map", _with_edges_of_the_level, "compute_gaussian_score()"
-            ),
+            Replacement(sys.modules[SCORES], "get_loss_map", _with_edges_of_the_level, "compute_gaussian_score()"),
             Replacement(
                 model, "densify_with_score", _unless_none_qualifies, "training() when it densifies", ("self", "scores")
             ),
@@ -130,7 +138,7 @@ def _with_edges_of_the_level(original: Callable[..., Tensor]) -> Callable[..., T
         reconstructed_image: Tensor, original_image: Tensor, config: Any, edges_loss_norm: Tensor
     ) -> Tensor:
         if edges_loss_norm.shape != original_image.shape[-2:]:
-            edges = sys.modules["utils.taming_utils"].get_edges(original_image).squeeze().to(original_image.device)
+            edges = sys.modules[SCORES].get_edges(original_image).squeeze().to(original_image.device)
             edges_loss_norm = (edges - edges.min()) / (edges.max() - edges.min())
         return original(reconstructed_image, original_image, config, edges_loss_norm)
 

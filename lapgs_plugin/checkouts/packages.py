@@ -11,8 +11,11 @@ from lapgs_plugin.environment import is_installed
 
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
+    "git": "gitpython",
+    "hydra": "hydra-core",
     "mpl_toolkits": "matplotlib",
     "PIL": "pillow",
+    "pylab": "matplotlib",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
     "yaml": "pyyaml",

@@ -24,7 +24,7 @@ class RasterizerUse:
         functions: functions of `holder` that use it.
         settings: names of the settings that are passed.
         inputs: names of the inputs that are passed.
-        outputs: number of outputs that are unpacked; 1 if they are not.
+        outputs: what outputs are unpacked into, names of variables in most checkouts; empty if they are not.
     """
 
     module: str
@@ -35,7 +35,7 @@ class RasterizerUse:
     functions: tuple[str, ...]
     settings: frozenset[str]
     inputs: frozenset[str]
-    outputs: int
+    outputs: tuple[str, ...]
 
 
 def unlike(use: RasterizerUse, names: Mapping[str, Any]) -> str:
@@ -115,7 +115,7 @@ def _use(
     makers = [call for call in calls if _original(call.func, own) and call not in settings]
     rasterizers = {target.id for target in _targets(function, makers) if isinstance(target, ast.Name)}
     renders = [call for call in calls if isinstance(call.func, ast.Name) and call.func.id in rasterizers] or makers
-    outputs = [len(target.elts) for target in _targets(function, renders) if isinstance(target, ast.Tuple)]
+    unpacked = [target.elts for target in _targets(function, renders) if isinstance(target, ast.Tuple)]
     alias = next(iter(own.values()))
     return RasterizerUse(
         module=alias.module,
@@ -126,7 +126,7 @@ def _use(
         functions=(function.name,),
         settings=frozenset(word.arg for call in settings for word in call.keywords if word.arg is not None),
         inputs=_inputs(function, renders),
-        outputs=max(outputs, default=1),
+        outputs=tuple(ast.unparse(element) for element in max(unpacked, key=len, default=[])),
     )
 
 
@@ -166,5 +166,5 @@ def _merged(one: RasterizerUse, other: RasterizerUse) -> RasterizerUse:
         functions=(*one.functions, *other.functions),
         settings=one.settings | other.settings,
         inputs=one.inputs | other.inputs,
-        outputs=max(one.outputs, other.outputs),
+        outputs=max(one.outputs, other.outputs, key=len),
     )

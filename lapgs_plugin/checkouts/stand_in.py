@@ -14,6 +14,14 @@ from lapgs_plugin.family.variants import VARIANTS, rasterizer_module
 OPTIONAL_INPUTS = {"dc", "raster_settings"}
 """Inputs that checkouts pass in one of several calls, and that of the constructor."""
 
+KINDS = {
+    "radii": "radii", "depth": "depth", "alpha": "alpha", "acc": "alpha", "opacity": "alpha", "silhouette": "alpha",
+}  # fmt: skip
+"""Kinds of outputs, as in `Variant.returned`, by the names of the variables that checkouts unpack them into."""
+
+DECORATIONS = "rendered_", "render_", "_image", "_map"
+"""Parts of these names that say nothing of the kind."""
+
 
 def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     """Return the variant of `family.VARIANTS` that fits the imports and calls of a checkout's training script.
@@ -33,6 +41,8 @@ def fitting_stand_in(checkout: Path, preferred: str = "") -> str:
     names = dict.fromkeys([preferred, *known] if preferred else known)
     lacks = {name: {} if source is None else dict.fromkeys(_lacks(name, source)) for name in names}
     near = min(lacks, key=lambda name: len(lacks[name]), default="")
+    if any(_unreturned(near, uses)):
+        near = next((name for name in lacks if not lacks[name] and _returns_as_named(name, uses)), near)
     faults = [*lacks.get(near, ()), *dict.fromkeys(_unreturned(near, uses))]
     if near and not faults:
         return near
@@ -70,12 +80,33 @@ def _lacks(variant: str, source: CheckoutSource) -> Iterator[tuple[str, str]]:
 
 
 def _unreturned(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[tuple[str, str]]:
-    """Yield the outputs that a variant would have to return, as `_lacks`; their number does not tell what they are."""
+    """Yield the outputs that a variant would have to return, as `_lacks`."""
+    for use, returned in _outputs(variant, uses):
+        if len(use.outputs) > len(returned):
+            yield "returns", f"{len(returned)} outputs, not {len(use.outputs)}"
+
+
+def _returns_as_named(variant: str, uses: Iterable[RasterizerUse]) -> bool:
+    """Return whether a variant returns what a checkout's variables say; their number does not tell what outputs are."""
+    pairs = list(_outputs(variant, uses))
+    return bool(pairs) and all(
+        [_kind(name) for name in use.outputs[1:]] == [*returned[1:]] for use, returned in pairs if use.outputs
+    )
+
+
+def _kind(variable: str) -> str:
+    """Return the kind of output that a variable is named after; empty for names such as `inv_depth`, too."""
+    for part in DECORATIONS:
+        variable = variable.replace(part, "")
+    return KINDS.get(variable, "")
+
+
+def _outputs(variant: str, uses: Iterable[RasterizerUse]) -> Iterator[tuple[RasterizerUse, tuple[str, ...]]]:
+    """Yield each use of a rasterizer whose outputs are known in a variant, with their kinds there."""
     offered = _offered(variant) if variant else {}
     for use in uses:
-        returned = VARIANTS[offered[use.module]].returned if use.module in offered else None
-        if returned is not None and use.outputs > returned:
-            yield "returns", f"{returned} outputs, not {use.outputs}"
+        if use.module in offered and (returned := VARIANTS[offered[use.module]].returned):
+            yield use, returned
 
 
 def _offered(variant: str) -> dict[str, str]:

@@ -79,9 +79,11 @@ def _source(path: Path) -> tuple[CheckoutSource, list[Finding]]:
         raise UserInputError(f"{path} is no 3DGS checkout: {advice}")
     sources, problems = readable_sources(path.absolute())
     if not sources:
-        lacks = "has no train*.py" if path.exists() else "does not exist"
-        missing = f"{path} {lacks}, expected the root of a 3DGS checkout, or its training script"
-        raise problems[0] if problems else UserInputError(missing)
+        raise (
+            problems[0]
+            if problems
+            else UserInputError(f"{path} {_lack(path)}, expected the root of a 3DGS checkout, or its training script")
+        )
     scripts = {str(source.script.relative_to(path.absolute())): source for source in sources}
     hindered = {name: why for name, source in scripts.items() if (why := _hindrance(source)) is not None}
     useful = [name for name in scripts if name not in hindered] or list(scripts)
@@ -95,6 +97,15 @@ def _source(path: Path) -> tuple[CheckoutSource, list[Finding]]:
     beside = [f"{', '.join(more)}; describe one with `lapgs doctor {path / more[0]}`"] if more else []
     unused = [Finding(name, "absent", why) for name, why in hindered.items() if name not in useful]
     return scripts[first], [*(Finding("Other scripts", "ok", text) for text in beside), *unused]
+
+
+def _lack(path: Path) -> str:
+    """Return why there is no training script at a path."""
+    if not path.exists():
+        return "does not exist"
+    if any(path.iterdir()):
+        return "has no train*.py"
+    return "is empty (in a clone `git submodule update --init --recursive` fills its submodules)"
 
 
 def _hindrance(source: CheckoutSource) -> str | None:
@@ -111,7 +122,9 @@ def _gaussians(source: CheckoutSource) -> str:
 
 def _rasterizer(use: RasterizerUse, source: CheckoutSource) -> Finding:
     inputs = ", ".join(sorted(use.inputs))
-    detail = f"{use.where} imports it for {', '.join(use.functions)}; outputs: {use.outputs}; inputs: {inputs}"
+    detail = (
+        f"{use.where} imports it for {', '.join(use.functions)}; outputs: {len(use.outputs) or 1}; inputs: {inputs}"
+    )
     if use.module in source.modules:
         return Finding(use.module, "ok", f"part of the checkout; {detail}")
     if is_installed(use.module):

@@ -232,6 +232,65 @@ class PixelGS(WholeSh):
         return super()._render(inputs._replace(means2d=points))
 
 
+class WithDepths(WholeSh):
+    """Return image, radii, and camera-space depth and alpha (1, h, w), which are blended as colours, over black."""
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        output = rasterize(self.raster_settings, inputs, Options())
+        depth, alpha = _depth_and_alpha(self.raster_settings, inputs)
+        return output.image, output.radii, depth, alpha
+
+
+class DepthsBeforeRadii(WithDepths):
+    """Return the same in another order: image, depth, alpha, radii."""
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        image, radii, depth, alpha = super()._render(inputs)
+        return image, depth, alpha, radii
+
+
+class Confident(WithDepths):
+    """Scale the gradients of each Gaussian by `confidence` (n, 1), but for that by `means2D`.
+
+    The third column of that gradient sums absolute values, as in one of the CUDA modules with this setting.
+    """
+
+    def _render(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        confidence = self.raster_settings.confidence.detach()
+        scaled = (None if t is None else _Scaled.apply(t, confidence) for t in inputs)  # type: ignore[no-untyped-call]  # torch's
+        four = _Padded.apply(inputs.means2d)  # type: ignore[no-untyped-call]  # torch's
+        return super()._render(Inputs._make(scaled)._replace(means2d=four))
+
+
+class _Scaled(torch.autograd.Function):
+    """Pass a tensor (n, ...) through; its gradient is multiplied by factors (n, 1), or (1, 1) for all."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, factors: Tensor) -> Tensor:
+        ctx.save_for_backward(factors)
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (factors,) = ctx.saved_tensors
+        return gradient * factors.reshape(-1, *(1,) * (gradient.ndim - 1)), None
+
+
+def _depth_and_alpha(settings: Any, inputs: Inputs) -> tuple[Tensor, Tensor]:
+    """Return camera-space depth and alpha (1, h, w) each, blended over black, with gradients by all of `inputs`."""
+    depths = depths_of(inputs.means, settings.viewmatrix)
+    colors = torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1)
+    image = _blended_over_black(settings, inputs, colors)
+    return image[:1], image[1:2]
+
+
+def _blended_over_black(settings: Any, inputs: Inputs, colors: Tensor) -> Tensor:
+    """Return values (n, 3) blended as colours, (3, h, w)."""
+    black = settings._replace(bg=torch.zeros_like(settings.bg))
+    return rasterize(black, inputs._replace(dc=None, sh=None, colors=colors), Options()).image
+
+
 class EfficientGS(Rasterizer):
     """Return image, radii and six tensors, of which those that the options ask for here are filled.
 
@@ -303,17 +362,13 @@ class Surfels(WholeSh):
         output = rasterize(settings, inputs, Options())
         normals = rotations[:, :, 2] @ settings.viewmatrix[:3, :3]
         centres = inputs.means @ settings.viewmatrix[:3, :3] + settings.viewmatrix[3, :3]
-        depths = centres[:, 2]
         normals = torch.where((normals * centres).sum(1, keepdim=True) > 0, -normals, normals)
-        black = settings._replace(bg=torch.zeros_like(settings.bg))
-        unshaded = inputs._replace(dc=None, sh=None, means2d=torch.zeros_like(inputs.means2d))
-        blended = [
-            rasterize(black, unshaded._replace(colors=colors), Options())
-            for colors in (torch.stack([depths, torch.ones_like(depths), torch.zeros_like(depths)], 1), normals)
-        ]
-        depth, alpha = blended[0].image[:1], blended[0].image[1:2]
+        unmoved = inputs._replace(means2d=torch.zeros_like(inputs.means2d))
+        depth, alpha = _depth_and_alpha(settings, unmoved)
         middle = (depth / alpha.clamp_min(1e-6)).detach()
-        maps = torch.cat([depth, alpha, blended[1].image, middle, torch.zeros_like(depth)])
+        maps = torch.cat(
+            [depth, alpha, _blended_over_black(settings, unmoved, normals), middle, torch.zeros_like(depth)]
+        )
         if maps.requires_grad:
             # Where nothing is blended, checkouts divide by an alpha of zero; the CUDA code reads no gradient there.
             maps.register_hook(torch.nan_to_num)  # type: ignore[no-untyped-call]  # torch's

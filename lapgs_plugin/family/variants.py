@@ -10,6 +10,7 @@ Matrices are transposed, as in the CUDA bindings. Settings beside those of the v
     kernel_size     Mip-Splatting: variance of the blur, in px^2
     subpixel_offset Mip-Splatting: (height, width, 2) added to the pixels' positions
     depth_threshold Pixel-GS: depth under which screen-space gradients are scaled down
+    confidence      FSGS, CoR-GS: (n, 1) factors on each Gaussian's gradients
     use_train_speedup, ignored_rate, lambda_dssim, use_hwc
                     EfficientGS: skip tiles in the backward pass; image as (height, width, 3)
 """
@@ -23,7 +24,9 @@ from functools import lru_cache
 from typing import Any
 
 from torch import Tensor
+from torch.nn.functional import interpolate
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family import forks
 from lapgs_plugin.family.binding import DcApart, Rasterizer, WholeSh
 from lapgs_plugin.family.call import SUMS, Options, Output
@@ -34,6 +37,7 @@ _VIEW = (
     "sh_degree", "campos",
 )  # fmt: skip
 _FAMILY = (*_VIEW, "prefiltered", "debug")
+_TWO = ("image", "radii")
 
 
 def _no_options(settings: Any) -> Options:
@@ -55,7 +59,7 @@ class Variant:
         settings: fields of its `GaussianRasterizationSettings`, in their order.
         options: from the settings of a call to its options of the engine.
         outputs: from these settings and the engine's output to the result of `forward`.
-        returned: number of outputs of `forward`, where it is always the same; None if it is not compared.
+        returned: kinds of the outputs of `forward`, where they are always the same; empty if they are not compared.
         module: name that checkouts import.
         binding: `GaussianRasterizer` without its `variant`; its `forward` has the arguments of the CUDA module's.
         sparse_adam: whether the module has `SparseGaussianAdam`.
@@ -71,7 +75,7 @@ class Variant:
     settings: tuple[str, ...] = _FAMILY
     options: Callable[[Any], Options] = _no_options
     outputs: Callable[[Any, Output], tuple[Tensor, ...]] = _image_and_radii
-    returned: int | None = None
+    returned: tuple[str, ...] = ()
     module: str = "diff_gaussian_rasterization"
     binding: type[Rasterizer] = WholeSh
     sparse_adam: bool = False
@@ -137,15 +141,30 @@ def _weight_rows(settings: Any) -> int:
     return 0 if settings.pixel_weights is None else len(settings.pixel_weights)
 
 
+def _weights(settings: Any) -> Tensor:
+    """Return the weights of the image's pixels, (height * width,).
+
+    DEPARTURE: those of an image of another size are resized, where the CUDA code reads whatever lies behind them. A
+    script that makes them once, at its start, has them of a coarser level.
+    """
+    weights: Tensor = settings.pixel_weights
+    size = int(settings.image_height), int(settings.image_width)
+    if weights.numel() == size[0] * size[1]:
+        return weights.reshape(-1)
+    if weights.ndim != 2:
+        raise UserInputError(f"pixel_weights is {tuple(weights.shape)}, expected {size}")
+    return interpolate(weights[None, None].float(), size, mode="bilinear").reshape(-1)
+
+
 _ANTIALIASED = Variant(
     "Stand in for graphdeco's rasterizer, branch dr_aa: with antialiasing and inverse depths.",
     (*_FAMILY, "antialiasing"),
     options=lambda settings: Options(antialiasing=settings.antialiasing, inverse_depth=True),
     outputs=_with_inverse_depths,
-    returned=3,
+    returned=(*_TWO, "depth"),
 )
 BACKBONES = {
-    "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main.", returned=2),
+    "graphdeco": Variant("Stand in for graphdeco's rasterizer, branch main.", returned=_TWO),
     "graphdeco-aa": _ANTIALIASED,
     # Two faults of the copies in circulation are left out: their backward pass counts a background that is not black
     # twice, and skips Gaussians at random after a reduction over the wrong number of threads.
@@ -161,7 +180,7 @@ BACKBONES = {
         (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
         options=lambda settings: (
-            Options(sums=SUMS, pixel_weights=settings.pixel_weights) if _weight_rows(settings) > 1 else Options()
+            Options(sums=SUMS, pixel_weights=_weights(settings)) if _weight_rows(settings) > 1 else Options()
         ),
         outputs=_with_sums,
         binding=DcApart,
@@ -169,7 +188,7 @@ BACKBONES = {
     ),
     "taming-rasterizer": Variant(
         "Stand in for the rasterizer of Taming-3DGS, branch rasterizer: with DC apart and sparse Adam.",
-        returned=2,
+        returned=_TWO,
         binding=DcApart,
         sparse_adam=True,
         fused_ssim=True,
@@ -226,7 +245,7 @@ FORKS = {
         "Stand in for the rasterizer of Mip-Splatting: with antialiasing, of any variance.",
         (*_VIEW[:4], "kernel_size", "subpixel_offset", *_VIEW[4:], "prefiltered", "debug"),
         options=lambda settings: Options(antialiasing=True, exact_antialiasing=True, blur=settings.kernel_size),
-        returned=2,
+        returned=_TWO,
         binding=forks.MipSplatting,
         unavailable="pixels that are moved by subpixel_offset (--ray_jitter)",
     ),
@@ -243,6 +262,23 @@ FORKS = {
         options=lambda settings: Options(sums=("counts",)),
         outputs=_with_pixels,
         binding=forks.PixelGS,
+    ),
+    "depth-and-alpha": Variant(
+        "Stand in for the rasterizers that return depth and alpha, too, as that of DreamGaussian and DNGaussian.",
+        returned=(*_TWO, "depth", "alpha"),
+        binding=forks.WithDepths,
+    ),
+    "depth-acc": Variant(
+        "Stand in for the rasterizer of DepthRegularizedGS: with depth and alpha, before the radii.",
+        returned=("image", "depth", "alpha", "radii"),
+        module="diff_gaussian_rasterization_depth_acc",
+        binding=forks.DepthsBeforeRadii,
+    ),
+    "confidence": Variant(
+        "Stand in for the rasterizer of FSGS and CoR-GS: with depth and alpha, and a factor on gradients.",
+        (*_FAMILY, "confidence"),
+        returned=(*_TWO, "depth", "alpha"),
+        binding=forks.Confident,
     ),
     "2dgs": Variant(
         "Stand in for the rasterizer of 2DGS: flat Gaussians, with depths and normals.",

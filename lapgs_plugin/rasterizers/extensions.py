@@ -42,7 +42,7 @@ CONSTANTS: dict[str, Any] = {
 """Settings of every call, unless a run was trained with others."""
 VARYING = (
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "viewmatrix", "projmatrix", "sh_degree", "campos",
-    "metric_map", "subpixel_offset",
+    "metric_map", "subpixel_offset", "confidence",
 )  # fmt: skip
 """Settings of a single call."""
 OTHER_INPUTS: dict[str, Callable[[Tensor], Tensor | None]] = {
@@ -166,7 +166,8 @@ class CudaExtension:
             inputs = _with_companion(inputs, camera, COMPANION_OPACITY / (POINT_DIMMING if antialiasing else 1))
         rasterizer = self._module.GaussianRasterizer(self._make_settings(camera, background, sh_degree))
         others = {name: make(inputs["means3D"]) for name, make in self._others.items()}
-        image, radii = rasterizer(**{key: value.contiguous() for key, value in inputs.items()}, **others)[:2]
+        image, *more = rasterizer(**{key: value.contiguous() for key, value in inputs.items()}, **others)
+        radii = next(one for one in more if one.ndim == 1)  # some return images before them
         return image, radii[:n]
 
     def _check(self, field: GaussianField, background: Tensor) -> None:
@@ -206,6 +207,8 @@ class CudaExtension:
             )
         if "subpixel_offset" in self._settings:
             values["subpixel_offset"] = torch.zeros(camera.height, camera.width, 2, device=background.device)
+        if "confidence" in self._settings:
+            values["confidence"] = torch.ones(1, 1, device=background.device)
         return self._module.GaussianRasterizationSettings(**{name: values[name] for name in self._settings})
 
 

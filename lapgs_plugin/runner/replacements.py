@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import ast
 import inspect
+import logging
 from collections.abc import Callable
 from functools import wraps
-from typing import Any
+from typing import Any, TypeGuard
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
 from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
 from lapgs_plugin.checkouts.rewriting import tree_of
-from lapgs_plugin.checkouts.syntax import called_methods, called_names
+from lapgs_plugin.checkouts.syntax import called_methods, called_name, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_noise, checkout_rotations
@@ -20,9 +21,15 @@ from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
 from lapgs_plugin.runner.kept_memory import keeping_memory
 from lapgs_plugin.runner.late_numbers import reading_late
+from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.step_clock import timing_replacements
 from lapgs_plugin.runner.visible_rows import VisibleRows
 from lapgs_plugin.scenes.masks import NONE
+
+logger = logging.getLogger(__name__)
+
+DENSIFICATION = "densif"
+"""Part of the names of the methods that densify a field, of all density control."""
 
 STATISTICS = "add_densification_stats"
 """Method of the family's models that sums gradients of the Gaussians that a view shows."""
@@ -207,16 +214,31 @@ class StageReplacements:
         return training_setup
 
     def _make_density_control(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a method of density control that tells the stage once the outermost of such calls is done."""
+        """Return a method of density control that tells the stage once the outermost of such calls is done.
+
+        Densification in the last iteration is left out: what it adds, on top of what it copies, is never trained.
+        Scripts of the family save their own model before it, which does not have it either.
+        """
+        name = original.__name__
+        can_be_left_out = DENSIFICATION in name and _returns_nothing_used(name, self._context.adapter.profile)
 
         @wraps(original)
         def control(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
             outermost, self._controlling = not self._controlling, True
+            stage = self._stages.running
+            if outermost and can_be_left_out and _is_last(stage) and stage.trains(gaussians):
+                self._controlling = False
+                logger.info(
+                    "level %d: %s() of its last iteration is left out, nothing trains what it adds",
+                    stage.stage.level,
+                    name,
+                )
+                return None
             try:
                 result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
-            if outermost and (stage := self._stages.running) is not None and stage.trains(gaussians):
+            if outermost and stage is not None and stage.trains(gaussians):
                 stage.densified(gaussians)
             return result
 
@@ -234,6 +256,19 @@ class StageReplacements:
             return None
 
         return reset_opacity
+
+
+def _is_last(stage: RunningStage | None) -> TypeGuard[RunningStage]:
+    """Return whether a stage runs in the last iteration of its call of `training`."""
+    return stage is not None and not stage.has_more
+
+
+def _returns_nothing_used(name: str, profile: Profile) -> bool:
+    """Return whether the loop calls a method, and drops what it returns."""
+    nodes = list(ast.walk(profile.source.training))
+    calls = [node for node in nodes if isinstance(node, ast.Call) and called_name(node) == name]
+    dropped = [node.value for node in nodes if isinstance(node, ast.Expr)]
+    return bool(calls) and all(call in dropped for call in calls)
 
 
 def _logs_scalars(function: Any) -> bool:

@@ -59,7 +59,7 @@ def test_a_fork_is_found_from_a_script_below_its_root(fork: Path) -> None:
     assert source.model[0] == "GaussianModel"
     assert source.model[1].startswith("scene/gaussian_model.py:")
     (use,) = source.rasterizers
-    assert (use.module, use.inside, use.functions, use.outputs) == (OTHER, True, ("render",), 3)
+    assert (use.module, use.inside, use.functions, len(use.outputs)) == (OTHER, True, ("render",), 3)
     assert use.names == ("GaussianRasterizationSettings", "GaussianRasterizer")
     assert {"antialiasing", "viewmatrix"} < use.settings
     assert adapter_class(fork).info.name == "generic", "its rasterizer is another one"
@@ -306,7 +306,10 @@ def test_a_script_of_no_checkout(tmp_path: Path, capsys: pytest.CaptureFixture[s
     with pytest.raises(UserInputError, match="is not the training script of a 3DGS checkout"):
         lapgs("doctor", tmp_path)
     script.unlink()
-    for folder, lacks in ((tmp_path, r"has no train\*.py"), (tmp_path / "nowhere", "does not exist")):
+    submodule = r"is empty \(in a clone `git submodule update --init --recursive` fills its submodules\)"
+    (tmp_path / "raster").mkdir()
+    folders = {tmp_path: r"has no train\*.py", tmp_path / "raster": submodule, tmp_path / "nowhere": "does not exist"}
+    for folder, lacks in folders.items():
         with pytest.raises(UserInputError, match=rf"{folder} {lacks}, expected the root of a 3DGS checkout"):
             lapgs("doctor", folder)
 

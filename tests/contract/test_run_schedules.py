@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from plyfile import PlyData
 
 from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
@@ -19,6 +20,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import Stage
 from tests.contract.stub_runs import (
     CHECKOUTS,
+    KINDS,
     NAMES,
     SHORT,
     STUBS,
@@ -286,6 +288,21 @@ def test_a_nested_level_ends_before_the_reset_that_comes_at_its_end(scene: Path,
     assert [record.iterations for record in archive.manifest.records] == [29, 61]
     opacities = torch.sigmoid(archive.field(1).opacity_logits)
     assert float(opacities.max()) > 0.05, "a reset leaves 0.01"
+
+
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_what_densification_would_add_in_the_last_iteration_is_not_archived(
+    hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A quick run of 7,000 iterations ends while a script still densifies: it saves its model before that."""
+    options = ("--densify_until_iter", 180, "--save_iterations", 90)
+    with caplog.at_level("INFO"):
+        archive, _ = run_hierarchy(STUBS["graphdeco"], scene, tmp_path / "run", *options, hierarchy=hierarchy, **THIRDS)
+    lines = [line for line in caplog.messages if "densify_and_prune() of its last iteration is left out" in line]
+    levels = ["level 0"] if hierarchy == "nested" else ["level 1", "level 0"]  # one call of nested levels ends once
+    assert [line.partition(":")[0] for line in lines] == levels
+    (saved,) = (tmp_path / "run" / "level_0").glob("point_cloud/iteration_*/point_cloud.ply")
+    assert len(PlyData.read(str(saved))["vertex"]) == len(archive.field(0))
 
 
 @pytest.mark.parametrize(("name", "hierarchy"), STUBS_AND_KINDS)

@@ -68,6 +68,16 @@ def test_a_fork_that_kept_a_file_is_recognised_by_what_it_renders_with(
     assert adapter_class(checkout).info.name == name
 
 
+def test_a_fork_that_kept_a_file_without_importing_it_is_not_its_source(tmp_path: Path) -> None:
+    """As a fork of Taming-3DGS that scores Gaussians in another way: nothing of that file is there to be replaced."""
+    checkout = changed(tmp_path)
+    (checkout / "utils" / "taming_utils.py").write_text("")
+    assert adapter_class(checkout).info.name == "graphdeco"
+    with (checkout / "train.py").open("a", encoding="utf-8") as script:
+        script.write("\nimport utils.taming_utils\n")
+    assert adapter_class(checkout).info.name == "taming"
+
+
 def test_a_fork_that_kept_filters_is_recognised_without_the_files_of_its_source(tmp_path: Path) -> None:
     """As a fork of Mip-Splatting that extracts meshes: its fields need the filters of its model applied."""
     checkout = changed(tmp_path, (BLUR, f"{BLUR}        kernel_size=0.1,\n"))
@@ -80,14 +90,36 @@ def test_a_fork_that_kept_filters_is_recognised_without_the_files_of_its_source(
 
 
 def test_a_rasterizer_that_returns_more_than_any_stand_in(tmp_path: Path) -> None:
-    """As those that return depth and alpha, too, and are otherwise called as graphdeco's."""
-    checkout = changed(tmp_path, ("rendered_image, radii = ", "rendered_image, radii, depth, alpha = "))
+    """Otherwise it is called as graphdeco's."""
+    checkout = changed(tmp_path, ("rendered_image, radii = ", "rendered_image, radii, normals, alpha = "))
     stand_in_is_refused(checkout, r"the nearest, graphdeco, returns 2 outputs, not 4; it needs")
 
 
+@pytest.mark.parametrize(
+    ("outputs", "stand_in"),
+    [
+        ("rendered_image, radii, depth, alpha", "depth-and-alpha"),
+        ("image, radii, rendered_depth, acc", "depth-and-alpha"),
+        ("image, radii, alpha, depth", ""),
+        ("image, depth, alpha, radii", ""),
+        ("image, radii, inv_depth, alpha", ""),
+        ("image, radii, depth", ""),
+    ],
+)
+def test_outputs_are_told_apart_by_the_variables_that_they_are_unpacked_into(
+    outputs: str, stand_in: str, tmp_path: Path
+) -> None:
+    """Several forks call graphdeco's module alike and get other outputs: as many say nothing of what they are."""
+    checkout = changed(tmp_path, ("rendered_image, radii = ", f"{outputs} = "))
+    if stand_in:
+        assert fitting_stand_in(checkout, "graphdeco") == stand_in
+    else:
+        stand_in_is_refused(checkout, "the nearest, graphdeco, returns 2 outputs, not")
+
+
 def test_a_setting_that_no_stand_in_takes(tmp_path: Path) -> None:
-    checkout = changed(tmp_path, (BLUR, f"{BLUR}        confidence=1.0,\n"))
-    stand_in_is_refused(checkout, r"gaussian_renderer/__init__.py:\d+, .* takes no setting confidence")
+    checkout = changed(tmp_path, (BLUR, f"{BLUR}        glow=1.0,\n"))
+    stand_in_is_refused(checkout, r"gaussian_renderer/__init__.py:\d+, .* takes no setting glow")
 
 
 def test_a_rasterizer_that_is_part_of_the_checkout(tmp_path: Path) -> None:
@@ -124,6 +156,8 @@ CALLS = {
     "speedy-splat": ("diff_gaussian_rasterization", "", "scores=None, "),
     "mip-splatting": ("diff_gaussian_rasterization", "kernel_size=0, subpixel_offset=0, ", ""),
     "absgs": ("diff_gaussian_rasterization_abs", "", ""),
+    "confidence": ("diff_gaussian_rasterization", "confidence=0, ", ""),
+    "depth-acc": ("diff_gaussian_rasterization_depth_acc", "", ""),
     "graphdeco": ("diff_gaussian_rasterization", "", ""),
     "graphdeco-aa": ("diff_gaussian_rasterization", "antialiasing=0, ", ""),
     None: ("diff_gaussian_rasterization", "glow=0, ", ""),

@@ -34,8 +34,8 @@ OF_OTHERS = {
     # of scripts of the backbones
     "--benchmark_dir", "--cams", "--cap_max", "--checkpoint_iterations", "--convert_SHs_python", "--debug_from",
     "--densification_interval", "--densify_from_iter", "--densify_until_iter", "--depth_loss", "--disable_viewer",
-    "--filter3d", "--grad_abs_thresh", "--gs_type", "--highfeature_lr", "--ho_iteration", "--kernel_size",
-    "--lambda_bce", "--loss_thresh", "--max_n_gaussian", "--mult",
+    "--filter3d", "--gaussiansN", "--grad_abs_thresh", "--gs_type", "--highfeature_lr", "--ho_iteration",
+    "--kernel_size", "--lambda_bce", "--loss_thresh", "--max_n_gaussian", "--mult", "--mv",
     "--opacity_reset_interval", "--optimizer_type", "--position_lr_final", "--position_lr_max_steps",
     "--prune_iterations", "--random_background", "--ray_jitter", "--S_estimator", "--save_iterations", "--sh_lower",
     "--start_checkpoint", "--target_primitives", "--test_iterations", "--use_train_speedup",

@@ -33,6 +33,7 @@ SETTINGS = {
     "antialiasing": True, "mult": 0.5, "get_flag": True, "metric_map": (MAP.view(-1) < 0.4).int(), "pixel_weights": MAP,
     "kernel_size": 0.1, "subpixel_offset": torch.zeros(HEIGHT, WIDTH, 2), "depth_threshold": 4.0,
     "use_train_speedup": False, "ignored_rate": 0.0, "lambda_dssim": 0.2, "use_hwc": False,
+    "confidence": torch.rand(N, 1, generator=torch.Generator().manual_seed(1)),
 }
 INPUTS = {
     "speedy-splat": {"scores": torch.zeros(N, 1)},
@@ -210,7 +211,7 @@ torch.cuda.set_sync_debug_mode("default")
 
 VARIANTS_OF_CLASSES = (
     "graphdeco", "graphdeco-aa", "taming", "fastgs", "speedy-splat", "mini-splatting", "mini-splatting2", "3dgs-mcmc",
-    "absgs", "mip-splatting", "efficientgs", "pixel-gs", "2dgs",
+    "absgs", "mip-splatting", "efficientgs", "pixel-gs", "2dgs", "depth-and-alpha", "depth-acc", "confidence",
 )  # fmt: skip
 needs_triton = pytest.mark.skipif(
     importlib.util.find_spec("triton") is None, reason="Triton comes with PyTorch for CUDA only"

@@ -193,6 +193,83 @@ def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
     assert 0 < float(losses.sum()) < float((shares * loss.sum(0)).sum())
 
 
+def test_pixel_weights_of_another_level_are_resized() -> None:
+    """A script that finds the edges of all photos at its start has those of the coarsest level ever after."""
+    case, module = small_case(), module_of("taming")
+    sums = []
+    for size in ((41, 53), (21, 27), (41 * 53,), (7, 5, 3)):
+        weights = torch.full(size, 0.5)
+        if len(size) == 3:
+            with pytest.raises(UserInputError, match=r"pixel_weights is \(7, 5, 3\), expected \(41, 53\)"):
+                call(module, "taming", case, activated(case), pixel_weights=weights)
+        else:
+            sums.append(call(module, "taming", case, activated(case), pixel_weights=weights)[9])
+    assert float(sums[0].max()) > 0
+    for other in sums[1:]:
+        assert torch.allclose(other, sums[0], rtol=1e-5)
+
+
+def with_depths(name: str, case: Case, **settings: Any) -> tuple[list[Tensor], list[Tensor]]:
+    """Return outputs of a variant, and gradients of the centres, opacities, SH and of `means2D` by all of them."""
+    module = module_of(name)
+    inputs = {key: value.detach().requires_grad_() for key, value in activated(case).items()}
+    points = torch.zeros(40, 3, requires_grad=True)
+    outputs = module.GaussianRasterizer(settings_of(module, case.camera, case.background, 3, **settings))(
+        means2D=points, **inputs
+    )
+    torch.stack([one.square().sum() for one in outputs if one.requires_grad]).sum().backward()
+    leaves = inputs["means3D"], inputs["opacities"], inputs["shs"], points
+    return list(outputs), [leaf.grad for leaf in leaves if leaf.grad is not None]
+
+
+def test_depth_and_alpha_are_blended_as_colours_with_gradients() -> None:
+    case = small_case()
+    (image, radii, depth, alpha), gradients = with_depths("depth-and-alpha", case)
+    shares, _ = blended(case)
+    wide = case.to(torch.float64)
+    seen = project(wide.field, wide.camera)
+    depths = torch.zeros(40, dtype=torch.float64).index_put((seen.ids,), seen.depths)
+    assert relative(depth[0], (shares * depths[:, None, None]).sum(0)) < BOUND
+    assert relative(alpha[0], shares.sum(0)) < BOUND
+    plain, plain_radii, _ = call(module_of("graphdeco"), "graphdeco", case, activated(case))
+    assert torch.equal(image, plain)
+    assert torch.equal(radii, plain_radii)
+    # By finite differences along the opacities, of which nothing is discrete but the threshold of 1/255.
+    field = case.field
+    step = 1e-3
+    losses = []
+    for sign in (1, -1):
+        moved = activated(case) | {"opacities": activated(case)["opacities"] + sign * step * gradients[1].sign()}
+        module = module_of("depth-and-alpha")
+        settings = settings_of(module, case.camera, case.background, 3)
+        outputs = module.GaussianRasterizer(settings)(means2D=torch.zeros(40, 3), **moved)
+        losses.append(sum(float(one.double().square().sum()) for one in (outputs[0], *outputs[2:])))
+    assert len(field) == 40
+    slope = (losses[0] - losses[1]) / (2 * step)
+    assert abs(slope / float(gradients[1].abs().sum()) - 1) < 0.02
+
+
+def test_the_same_outputs_in_another_order_have_the_same_gradients() -> None:
+    case = small_case()
+    (image, radii, depth, alpha), gradients = with_depths("depth-and-alpha", case)
+    others, other_gradients = with_depths("depth-acc", case)
+    for one, other in zip((image, depth, alpha, radii, *gradients), (*others, *other_gradients), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_confidence_scales_the_gradients_of_each_gaussian_but_for_those_of_the_centres_on_screen() -> None:
+    case = small_case()
+    confidence = torch.rand(40, 1, generator=torch.Generator().manual_seed(2))
+    outputs, gradients = with_depths("depth-and-alpha", case)
+    others, scaled = with_depths("confidence", case, confidence=confidence)
+    for one, other in zip(outputs, others, strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(gradients[:3], scaled[:3], strict=True):
+        assert torch.allclose(one * confidence.reshape(-1, *(1,) * (one.ndim - 1)), other, rtol=1e-6)
+    assert torch.equal(gradients[3][:, :2], scaled[3][:, :2])
+    assert bool((scaled[3][:, 2] >= scaled[3][:, :2].abs().sum(1) * (1 - 1e-5)).all()), "sums of absolute values"
+
+
 def test_surfels_are_flat_gaussians_with_depths_and_normals() -> None:
     case = small_case()
     inputs = activated(case)
