@@ -63,14 +63,15 @@ class _Call:
     """
 
     def __init__(self, settings: Settings, inputs: Inputs, options: Options) -> None:
-        self.is_empty = len(inputs.means) == 0
+        n = inputs.means.shape[0]
+        self.is_empty = n == 0
         self.size = int(settings.image_width), int(settings.image_height)
         if max(self.size) > LONGEST_SIDE:
             width, height = self.size
             raise UserInputError(f"an image of {width}x{height} pixels: expected {LONGEST_SIDE} a side at most")
         coefficients = 0 if inputs.sh is None else 3 * (inputs.sh.shape[1] + 1)
-        if (most := MOST_NUMBERS // max(coefficients, RECORD)) < len(inputs.means):
-            raise UserInputError(f"{len(inputs.means)} Gaussians: expected {most} at most with as many coefficients")
+        if (most := MOST_NUMBERS // max(coefficients, RECORD)) < n:
+            raise UserInputError(f"{n} Gaussians: expected {most} at most with as many coefficients")
         self.rules = Rules(
             family=True,
             covariances=inputs.covariances is not None,
@@ -139,7 +140,7 @@ class _Rasterize(torch.autograd.Function):
             return image, image[:1].clone(), radii, centres, depths
         parameters, first = _parameters(inputs)
         rules, mult = call.rules, call.numbers.mult
-        frame, into = take_frame(parameters.means, len(parameters.means), call.size, rules, mult) or (None, None)
+        frame, into = take_frame(parameters.means, parameters.means.shape[0], call.size, rules, mult) or (None, None)
         seen = project(parameters, call.camera, call.degree, call.signed, True, rules, call.numbers, first, into)
         tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
             seen, call.background, call.size, rules, mult, frame
