@@ -18,7 +18,7 @@ from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.records import RECORD, TILE, Blended, Parameters, aligned
 from lapgs_plugin.gpu_raster.replay import take_frame
 from lapgs_plugin.gpu_raster.rules import Numbers, Rules
-from lapgs_plugin.gpu_raster.tiles import blend_family_in_tiles
+from lapgs_plugin.gpu_raster.tiles import Pairs, blend_family_in_tiles
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
 LONGEST_SIDE = TILE * (2**15 - 1)
@@ -36,9 +36,19 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     Raises:
         UserInputError: the image is too large for the kernels, or there are too many Gaussians.
     """
-    call = _Call(settings, inputs, options)
+    while True:
+        call = _Call(settings, inputs, options)
+        output = _attempt(call, inputs, options)
+        pairs, call.pairs, call.blended = call.pairs, None, None  # the backward pass needs neither
+        if pairs is None or pairs.fit():  # this waits for the GPU, which has all of the work by now
+            return output
+        del output  # which lacks some pairs; its memory is needed
+
+
+def _attempt(call: _Call, inputs: Inputs, options: Options) -> Output:
+    """Return the output if there is room for all pairs of Gaussians and tiles."""
     image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
-    output = Output(
+    return Output(
         image,
         radii,
         inverse_depths if options.inverse_depth else None,
@@ -47,8 +57,6 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
         _contributions(call, options) if options.sums else None,
         _Blending(call) if options.blending else None,
     )
-    call.blended = None  # the backward pass needs less
-    return output
 
 
 class _Call:
@@ -60,6 +68,7 @@ class _Call:
         columns: of the gradient by the centres.
         keeps: whether to keep what was blended for sums over pixels.
         blended: that, or None before, or if there are no Gaussians.
+        pairs: of Gaussians and tiles, or None before, or if there are no Gaussians.
     """
 
     def __init__(self, settings: Settings, inputs: Inputs, options: Options) -> None:
@@ -84,6 +93,7 @@ class _Call:
         mult = 1.0 if options.mult is None else float(options.mult)
         self.keeps = bool(options.sums) or options.blending
         self.blended: Blended | None = None
+        self.pairs: Pairs | None = None
         self.numbers = Numbers(float(settings.scale_modifier), float(options.blur), mult)
         degree = int(settings.sh_degree)
         self.degree, self.signed, self.columns = degree & ~SIGNED_COLOR_BIT, degree < 0, inputs.means2d.shape[1]
@@ -142,7 +152,7 @@ class _Rasterize(torch.autograd.Function):
         rules, mult = call.rules, call.numbers.mult
         frame, into = take_frame(parameters.means, parameters.means.shape[0], call.size, rules, mult) or (None, None)
         seen = project(parameters, call.camera, call.degree, call.signed, True, rules, call.numbers, first, into)
-        tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
+        tiles, (image, inverse_depths, counts, words), call.pairs = blend_family_in_tiles(
             seen, call.background, call.size, rules, mult, frame
         )
         ctx.save_for_backward(
