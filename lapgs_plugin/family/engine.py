@@ -42,7 +42,7 @@ def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
 
 def _check(settings: Settings, inputs: Inputs) -> None:
     """Refuse tensors that kernels would read out of bounds."""
-    n, device = len(inputs.means), inputs.means.device
+    n, device = inputs.means.shape[0], inputs.means.device
     wanted = (
         ("means3D", inputs.means, (n, 3)),
         ("opacities", inputs.opacities, (n, 1)),

@@ -18,7 +18,7 @@ from lapgs_plugin.gpu_raster.cameras import DeviceCameras
 from lapgs_plugin.gpu_raster.records import RECORD, TILE, Blended, Parameters, aligned
 from lapgs_plugin.gpu_raster.replay import take_frame
 from lapgs_plugin.gpu_raster.rules import Numbers, Rules
-from lapgs_plugin.gpu_raster.tiles import blend_family_in_tiles
+from lapgs_plugin.gpu_raster.tiles import Pairs, blend_family_in_tiles
 from lapgs_plugin.reference_raster.layout import SIGNED_COLOR_BIT
 
 LONGEST_SIDE = TILE * (2**15 - 1)
@@ -36,9 +36,19 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     Raises:
         UserInputError: the image is too large for the kernels, or there are too many Gaussians.
     """
-    call = _Call(settings, inputs, options)
+    while True:
+        call = _Call(settings, inputs, options)
+        output = _attempt(call, inputs, options)
+        pairs, call.pairs, call.blended = call.pairs, None, None  # the backward pass needs neither
+        if pairs is None or pairs.fit():  # this waits for the GPU, which has all of the work by now
+            return output
+        del output  # which lacks some pairs; its memory is needed
+
+
+def _attempt(call: _Call, inputs: Inputs, options: Options) -> Output:
+    """Return the output if there is room for all pairs of Gaussians and tiles."""
     image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
-    output = Output(
+    return Output(
         image,
         radii,
         inverse_depths if options.inverse_depth else None,
@@ -47,8 +57,6 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
         _contributions(call, options) if options.sums else None,
         _Blending(call) if options.blending else None,
     )
-    call.blended = None  # the backward pass needs less
-    return output
 
 
 class _Call:
@@ -60,17 +68,19 @@ class _Call:
         columns: of the gradient by the centres.
         keeps: whether to keep what was blended for sums over pixels.
         blended: that, or None before, or if there are no Gaussians.
+        pairs: of Gaussians and tiles, or None before, or if there are no Gaussians.
     """
 
     def __init__(self, settings: Settings, inputs: Inputs, options: Options) -> None:
-        self.is_empty = len(inputs.means) == 0
+        n = inputs.means.shape[0]
+        self.is_empty = n == 0
         self.size = int(settings.image_width), int(settings.image_height)
         if max(self.size) > LONGEST_SIDE:
             width, height = self.size
             raise UserInputError(f"an image of {width}x{height} pixels: expected {LONGEST_SIDE} a side at most")
         coefficients = 0 if inputs.sh is None else 3 * (inputs.sh.shape[1] + 1)
-        if (most := MOST_NUMBERS // max(coefficients, RECORD)) < len(inputs.means):
-            raise UserInputError(f"{len(inputs.means)} Gaussians: expected {most} at most with as many coefficients")
+        if (most := MOST_NUMBERS // max(coefficients, RECORD)) < n:
+            raise UserInputError(f"{n} Gaussians: expected {most} at most with as many coefficients")
         self.rules = Rules(
             family=True,
             covariances=inputs.covariances is not None,
@@ -83,6 +93,7 @@ class _Call:
         mult = 1.0 if options.mult is None else float(options.mult)
         self.keeps = bool(options.sums) or options.blending
         self.blended: Blended | None = None
+        self.pairs: Pairs | None = None
         self.numbers = Numbers(float(settings.scale_modifier), float(options.blur), mult)
         degree = int(settings.sh_degree)
         self.degree, self.signed, self.columns = degree & ~SIGNED_COLOR_BIT, degree < 0, inputs.means2d.shape[1]
@@ -139,9 +150,9 @@ class _Rasterize(torch.autograd.Function):
             return image, image[:1].clone(), radii, centres, depths
         parameters, first = _parameters(inputs)
         rules, mult = call.rules, call.numbers.mult
-        frame, into = take_frame(parameters.means, len(parameters.means), call.size, rules, mult) or (None, None)
+        frame, into = take_frame(parameters.means, parameters.means.shape[0], call.size, rules, mult) or (None, None)
         seen = project(parameters, call.camera, call.degree, call.signed, True, rules, call.numbers, first, into)
-        tiles, (image, inverse_depths, counts, words) = blend_family_in_tiles(
+        tiles, (image, inverse_depths, counts, words), call.pairs = blend_family_in_tiles(
             seen, call.background, call.size, rules, mult, frame
         )
         ctx.save_for_backward(

@@ -297,8 +297,8 @@ def _blend(
     records: Tensor, background: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, inverse_depths: Tensor,
     rules: Rules, mult: float, shape: Shape,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    programs, numbers = launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
-    words = flat.new_empty((len(flat) // WARP + len(offsets)) * shape.regions)
+    programs, numbers = launch_of(offsets, flat, _size_of(images, rules), images.shape[0], shape)
+    words = flat.new_empty((flat.numel() // WARP + offsets.numel()) * shape.regions)
     launch(
         reach_kernel, (programs // shape.regions,),
         records, offsets, flat, words, *numbers[2:], mult,
@@ -336,8 +336,8 @@ def blend_backward(
     Returns:
         Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and the others (c, n, OTHERS).
     """
-    programs, numbers = launch_of(offsets, flat, _size_of(images, rules), len(images), shape)
-    assert len(counts) == programs
+    programs, numbers = launch_of(offsets, flat, _size_of(images, rules), images.shape[0], shape)
+    assert counts.numel() == programs
     count, stride = records.numel() // RECORD, OTHERS[absolute, rules.depth]
     zeros = records.new_zeros((GRADIENT + stride) * count)  # in one launch
     gradients, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]

@@ -648,7 +648,7 @@ def project(
         first: (n, 1, 3) first coefficients, if they are apart.
         into: radii, centres, depths and records to write to, as in `Projected`; None for new ones.
     """
-    count, n, like = len(cameras.poses), len(parameters.means), parameters.means
+    count, n, like = cameras.poses.shape[0], parameters.means.shape[0], parameters.means
     if into is None:
         into = (
             like.new_empty(count, n, 2, dtype=torch.int32), like.new_empty(count, 0 if rules.family else n, 2),
@@ -694,7 +694,7 @@ def _project(
     parameters: Parameters, first: Tensor | None, cameras: DeviceCameras, chosen: tuple[int, int], degree: int,
     signed: bool, into: Projected, start: int, with_geometry: bool, rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
-    n = len(parameters.means)
+    n = parameters.means.shape[0]
     launch(
         _project_kernel, (blocks(n, BLOCK),),
         *parameters, parameters.sh if first is None else first, *cameras[:3], _sizes_of(cameras), *into,
@@ -740,7 +740,7 @@ def project_family_backward(
     """
     by = Parameters(*(torch.empty_like(value) for value in parameters))
     by_first = None if first is None else torch.empty_like(first)
-    by_screen = parameters.means.new_empty(len(parameters.means), columns)
+    by_screen = parameters.means.new_empty(parameters.means.shape[0], columns)
     _project_backward(
         parameters, first, cameras, degree, signed, radii, records, by_records, others, by, by_first, by_screen,
         rules, numbers,
@@ -753,7 +753,8 @@ def _project_backward(
     records: Tensor, by_records: Tensor, others: Tensor, by: Parameters, by_first: Tensor | None,
     by_screen: Tensor | None, rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
-    n, count, coefficients = len(parameters.means), len(cameras.poses), _coefficients(parameters.sh, rules)
+    n, count = parameters.means.shape[0], cameras.poses.shape[0]
+    coefficients = _coefficients(parameters.sh, rules)
     launch(
         _shape_gradient_kernel, (blocks(n, BLOCK),),
         *parameters[:4], *cameras[:2], _sizes_of(cameras), radii, records, by_records, others,

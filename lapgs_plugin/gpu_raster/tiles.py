@@ -4,7 +4,8 @@ How much memory the pairs of Gaussians and tiles take is only known on the GPU. 
 renders before had, and some more. Sorting and blending are launched with that room, and pairs that have no place in it
 are left out. Then the processor reads the number of pairs, which the GPU knew before it began to sort: while it sorts
 and blends, it has work, and the processor goes on in time. If there was too little room, both are launched again with
-enough. This happens before anybody gets the image, and is seldom.
+enough. This happens before anybody gets the image, and is seldom. By the family's rules the processor first launches
+all else that belongs to a render.
 
 Where gsplat's CUDA part is built already, its sorting is used, which takes the processor less time to launch.
 """
@@ -12,7 +13,6 @@ Where gsplat's CUDA part is built already, its sorting is used, which takes the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -87,7 +87,7 @@ def blend_family_in_tiles(
     rules: Rules,
     mult: float,
     frame: Frame | None = None,
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor], Pairs]:
     """Sort Gaussians of one camera into tiles, front to back, and blend them by the family's rules.
 
     Args:
@@ -95,7 +95,8 @@ def blend_family_in_tiles(
         frame: that they were projected to.
 
     Returns:
-        Offsets and Gaussians of pairs as `blend_family` takes them, and its results.
+        Offsets and Gaussians of pairs as `blend_family` takes them, its results, and the pairs. If these do not fit,
+        all has to be made again.
 
     Raises:
         DeviceMemoryError: there are 2**31 pairs or more.
@@ -106,35 +107,53 @@ def blend_family_in_tiles(
     radii, means2d, depths, records = projected[:4]
     key = records.device, *size, rules
     if frame is not None:
-        return _with_room(key, frame.sort(), partial(frame.blend, background))
+        pairs = Pairs(key, frame.sort())
+        return *frame.blend(background, pairs.room), pairs
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid, True)
-
-    def attempt(room: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
-        tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, room, True)
-        return tiles, blend_family(records, background, *tiles, size, rules, mult)
-
-    return _with_room(key, ends[-1], attempt)
+    pairs = Pairs(key, ends[-1])
+    tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, pairs.room, True)
+    return tiles, blend_family(records, background, *tiles, size, rules, mult), pairs
 
 
 def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
     """Return what an attempt with enough room makes.
 
     Args:
-        key: of renders that have about as many pairs.
-        number: of pairs, on the device.
+        key, number: as `Pairs` takes them.
         attempt: launches what has room for as many pairs.
     """
-    pairs = _LateNumber(number)
-    room = _rounded(_rooms[key] if key in _rooms else MARGIN * pairs.read())
     while True:
-        result = attempt(room)
-        wanted = MARGIN * pairs.read()
-        _rooms[key] = max(wanted, (1 - FORGOTTEN) * _rooms.get(key, 0.0))
-        if pairs.read() <= room:
+        pairs = Pairs(key, number)
+        result = attempt(pairs.room)
+        if pairs.fit():
             return result
         del result  # its memory is needed
-        room = _rounded(wanted)
+
+
+class Pairs:
+    """Estimate how many pairs a render has, and say later whether there was room for all.
+
+    Args:
+        key: of renders that have about as many.
+        number: of pairs, on the device.
+
+    Attributes:
+        room: for pairs.
+
+    Raises:
+        DeviceMemoryError: there are 2**31 pairs or more.
+    """
+
+    def __init__(self, key: tuple[Any, ...], number: Tensor) -> None:
+        self._key, self._number = key, _LateNumber(number)
+        self.room = _rounded(_rooms[key] if key in _rooms else MARGIN * self._number.read())
+
+    def fit(self) -> bool:
+        """Wait for their number, from which the next render has its room; return whether there was room for all."""
+        number = self._number.read()
+        _rooms[self._key] = max(MARGIN * number, (1 - FORGOTTEN) * _rooms.get(self._key, 0.0))
+        return number <= self.room
 
 
 def _rounded(pairs: float) -> int:

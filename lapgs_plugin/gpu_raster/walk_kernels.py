@@ -349,4 +349,4 @@ def launch_of(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the number of programs and the arguments named in `NOT_SPECIALIZED`."""
     across, down = grid_of(size)
-    return count * across * down * shape.regions, (*size, across, across * down, len(offsets), len(flat))
+    return count * across * down * shape.regions, (*size, across, across * down, offsets.numel(), flat.numel())

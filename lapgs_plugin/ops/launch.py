@@ -92,9 +92,10 @@ def _start_directly(
     if addresses % 16 != 0:
         return False
     key = (kernel.fn, device, *kinds, *constants, *constants.values())
-    if key not in _starts:
-        _starts[key] = _compiled(kernel, arguments, constants)
-    start = _starts[key]
+    try:  # its hash takes a while
+        start = _starts[key]
+    except KeyError:
+        start = _starts[key] = _compiled(kernel, arguments, constants)
     if start is None:
         return False
     start(programs, numbers)

@@ -143,7 +143,7 @@ class ActiveStage(RunningStage):
             self._prune(gaussians)
         if iteration == self._joint_from:
             self._train_jointly(gaussians)
-        count = len(gaussians._xyz) + self._joint_count
+        count = gaussians._xyz.shape[0] + self._joint_count
         self.record.count(iteration, count)
         if iteration % self.record.history_every == 0:
             self.record.write_history(iteration, {"elapsed": self.record.elapsed_in_run(), "num_gaussians": count})

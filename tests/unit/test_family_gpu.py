@@ -232,6 +232,30 @@ for key, value in found[0].items():
     assert relative(found[1][key], value) < 1e-6, key  # worst seen 1e-7
 """
 
+LITTLE_ROOM = """
+tiles.LEAST_ROOM = 8
+
+
+def rendered():
+    inputs = inputs_of(small(), DEVICE, columns=4)
+    options = Options(sums=("counts", "blending"), inverse_depth=True)
+    output = gpu.rasterize(settings_of(small(), DEVICE), inputs, options)
+    (output.image.square().sum() + output.inverse_depths.sum()).backward()
+    outputs = {key: getattr(output, key) for key in ("image", "inverse_depths", "radii", "centres", "depths")}
+    return outputs | {key: output.sum(key) for key in options.sums} | gradients(inputs)
+
+
+first = rendered()
+(room,) = tiles._rooms.values()
+assert room > 8, room
+for key in tiles._rooms:
+    tiles._rooms[key] = 1.0
+again = rendered()
+assert list(tiles._rooms.values()) == [room]
+for key, value in first.items():
+    assert relative(again[key], value) < 1e-6, key  # worst seen 0
+"""
+
 REPLAYED = """
 import gc
 import weakref
@@ -334,6 +358,11 @@ def test_compiled() -> None:
 @needs_cuda
 def test_views_by_graphs_equal_those_without() -> None:
     run_checks("cuda", COMMON + REPLAYED)
+
+
+@needs_triton
+def test_views_for_which_there_was_too_little_room_are_rendered_again() -> None:
+    run_checks("cpu", COMMON + LITTLE_ROOM, TRITON_INTERPRET="1")
 
 
 @needs_triton

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from lapgs_plugin.ops.adam import multi_tensor
 from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam, fuse_steps
@@ -110,6 +111,40 @@ def test_hooks_and_closures_are_called_once(works: None) -> None:
     assert called == ["before", "closure", "after"], "hooks are not copied, as of any optimizer"
     optimizer.step()
     assert called == ["before", "closure", "after", "before", "after"]
+
+
+def test_hooks_of_all_optimizers_are_called(works: None) -> None:
+    parameters, optimizer = new_adam("cpu")
+    fuse_steps(optimizer)
+    called: list[str] = []
+    handles = (
+        register_optimizer_step_pre_hook(lambda *_: called.append("before")),
+        register_optimizer_step_post_hook(lambda *_: called.append("after")),
+    )
+    step(parameters, optimizer, 0)
+    for handle in handles:
+        handle.remove()
+    step(parameters, optimizer, 1)
+    assert called == ["before", "after"]
+
+
+def test_gradients_are_forgotten_or_filled_with_zeros(works: None) -> None:
+    (parameter, *_), optimizer = new_adam("cpu")
+    fuse_steps(optimizer)
+    parameter.grad = torch.ones_like(parameter)
+    optimizer.zero_grad(set_to_none=False)
+    assert not parameter.grad.any()
+    optimizer.zero_grad()
+    assert parameter.grad is None
+
+
+def test_profiles_name_a_step(works: None) -> None:
+    parameters, optimizer = new_adam("cpu")
+    fuse_steps(optimizer)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        step(parameters, optimizer, 0)
+    names = [event.key.partition("#")[0] for event in profile.key_averages()]
+    assert {"Optimizer.step", "Optimizer.zero_grad"} <= set(names)
 
 
 @pytest.mark.parametrize("device", DEVICES)

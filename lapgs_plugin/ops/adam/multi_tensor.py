@@ -11,7 +11,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import profiler
 from torch.optim.adam import adam
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 from lapgs_plugin.ops.self_check import largest, matches_reference
@@ -21,12 +23,29 @@ class MultiTensorAdam(torch.optim.Adam):
     """Step as `torch.optim.Adam` does, with its groups, state and hooks; results differ by rounding.
 
     `fuse_steps` makes optimizers of this class. It supports none of the options of `torch.optim.Adam`.
+
+    Where nobody looks on, it does not name its work in profiles, which takes PyTorch as long as some launches.
     """
 
-    @torch.optim.Optimizer.profile_hook_step
-    @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Step all tensors that have a gradient, after `closure`, whose result is returned."""
+        own = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
+        hooks = own or _global_optimizer_pre_hooks or _global_optimizer_post_hooks
+        return self._watched_step(closure) if hooks or profiler._is_profiler_enabled else self._step(closure)
+
+    step.hooked = True  # type: ignore[attr-defined]  # as PyTorch marks it, which else calls hooks twice
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forget all gradients, or fill them with zeros."""
+        if not set_to_none or profiler._is_profiler_enabled:
+            super().zero_grad(set_to_none)
+            return
+        for group in self.param_groups:
+            for values in group["params"]:
+                values.grad = None
+
+    @torch.no_grad()
+    def _step(self, closure: Callable[[], Any] | None) -> Any:
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -43,7 +62,7 @@ class MultiTensorAdam(torch.optim.Adam):
             _step_together(together, (beta1, beta2), eps)
         return loss
 
-    step.hooked = True  # type: ignore[attr-defined]  # as PyTorch marks it, which else calls hooks twice
+    _watched_step = torch.optim.Optimizer.profile_hook_step(_step)
 
 
 def _slot(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[str, Any]) -> AdamSlot | None:

@@ -35,7 +35,7 @@ def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
 
 def _is_mask(mask: Any) -> bool:
     is_rows = isinstance(mask, Tensor) and mask.dtype is torch.bool and mask.ndim == 1
-    return is_rows and 0 < len(mask) < 2**31 and mask.is_contiguous()
+    return is_rows and 0 < mask.shape[0] < 2**31 and mask.is_contiguous()
 
 
 def _fits(update: Update, mask: Tensor) -> bool:
@@ -50,7 +50,7 @@ def _fits(update: Update, mask: Tensor) -> bool:
         _is_readable(source, mask)
         and source.dtype is torch.float32
         and source.ndim == target.ndim == 2
-        and len(source) == n
+        and source.shape[0] == n
         and 1 <= len(update.read_columns) <= 2
     )
 

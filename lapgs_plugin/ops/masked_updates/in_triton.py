@@ -101,7 +101,7 @@ def _launch(mask: Tensor, updates: Sequence[Update]) -> None:
         # What a kernel does not read is any tensor.
         tensors += target, source if isinstance(source, Tensor) else target, target if factor is None else factor
     tensors += [mask] * 3 * (MOST - len(updates))
-    n = len(mask)
+    n = mask.shape[0]
     launch(_kernel, (blocks(n, BLOCK),), *tensors, n, 0, **_constants(tuple(kinds)), block=BLOCK)
 
 

@@ -15,7 +15,7 @@ def unit_quaternions(quaternions: Tensor) -> Tensor:
     Args:
         quaternions: (n, 4); other tensors are normalised by PyTorch along their second axis.
     """
-    rows = quaternions.ndim == 2 and quaternions.shape[1:] == (4,) and len(quaternions) > 0
+    rows = quaternions.ndim == 2 and quaternions.shape[1:] == (4,) and quaternions.shape[0] > 0
     if rows and quaternions.is_contiguous() and triton_works(quaternions):
         from lapgs_plugin.ops.unit_quaternions.in_triton import unit_quaternions_triton
 

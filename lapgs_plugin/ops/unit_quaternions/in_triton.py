@@ -44,7 +44,8 @@ class _UnitQuaternions(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, quaternions: Tensor) -> Tensor:
         units = torch.empty_like(quaternions)
-        launch(_kernel, (blocks(len(units), BLOCK),), quaternions, units, len(units), block=BLOCK)
+        n = units.shape[0]
+        launch(_kernel, (blocks(n, BLOCK),), quaternions, units, n, block=BLOCK)
         ctx.save_for_backward(quaternions)
         return units
 
@@ -53,7 +54,7 @@ class _UnitQuaternions(torch.autograd.Function):
     def backward(ctx: Any, by_units: Tensor) -> Tensor:
         (quaternions,) = ctx.saved_tensors
         gradient = torch.empty_like(quaternions)
-        n = len(gradient)
+        n = gradient.shape[0]
         launch(_gradient_kernel, (blocks(n, BLOCK),), quaternions, by_units.contiguous(), gradient, n, block=BLOCK)
         return gradient
 
