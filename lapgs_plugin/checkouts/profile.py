@@ -89,12 +89,6 @@ class Profile:
         self.rasterizers = tuple(self._find_rasterizers())
 
     @property
-    def freeing(self) -> tuple[str, ...]:
-        """Names of the model's methods that give unused GPU memory back."""
-        methods = inspect.getmembers(self.model, inspect.isfunction)
-        return tuple(name for name, method in methods if "empty_cache" in _names(method))
-
-    @property
     def density_control(self) -> tuple[str, ...]:
         """Names of the model's methods that add, remove or reset Gaussians, directly or through others."""
         return tuple(sorted(_changing(self.model)))

@@ -85,7 +85,6 @@ class StageReplacements:
             *self._in_losses(profile),
             *self._in_reports(profile),
             *self._in_rotations(profile),
-            *self._in_freeing(profile),
             *checkout_filters.replacements(profile.model, "training() when it renders and densifies"),
             *parts.replacements(profile, adapter.info),
         ]
@@ -158,15 +157,6 @@ class StageReplacements:
         replacement = Replacement(script, name, checkout_rotations.in_our_kernel, "training() in its noise")
         return [replacement] if inspect.isfunction(vars(script).get(name)) else []
 
-    @staticmethod
-    def _in_freeing(profile: Profile) -> list[Replacement]:
-        """Return replacements of the model's methods that give unused GPU memory back, so that some is kept."""
-        return [
-            replacement
-            for name in profile.freeing
-            for replacement in of_class(profile.model, name, keeping_memory, "training() when it densifies")
-        ]
-
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
         rows = self._context.wrapper.rows
@@ -235,7 +225,8 @@ class StageReplacements:
                 )
                 return None
             try:
-                result = original(gaussians, *args, **kwargs)
+                with keeping_memory():
+                    result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
             if outermost and stage is not None and stage.trains(gaussians):

@@ -31,13 +31,10 @@ def _on_gpu(monkeypatch: pytest.MonkeyPatch, reserved: int, allocated: int, *, t
 def test_little_is_kept(monkeypatch: pytest.MonkeyPatch, reserved: int, there: bool, expected: int) -> None:
     emptied = _on_gpu(monkeypatch, reserved * GIB, 4 * GIB, there=there)
     original = torch.cuda.empty_cache
-
-    @keeping_memory
-    def prune(count: int) -> int:
+    with keeping_memory():
         torch.cuda.empty_cache()
-        return count if count == 0 else prune(count - 1)  # a method that calls another
-
-    assert prune(1) == 0
+        with keeping_memory():  # a method that calls another
+            torch.cuda.empty_cache()
     assert len(emptied) == expected
     assert torch.cuda.empty_cache is original
     torch.cuda.empty_cache()
@@ -47,11 +44,6 @@ def test_little_is_kept(monkeypatch: pytest.MonkeyPatch, reserved: int, there: b
 def test_it_is_restored_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     _on_gpu(monkeypatch, 6 * GIB, 4 * GIB)
     original = torch.cuda.empty_cache
-
-    @keeping_memory
-    def prune() -> None:
+    with pytest.raises(ValueError, match="of the checkout"), keeping_memory():
         raise ValueError("of the checkout")
-
-    with pytest.raises(ValueError, match="of the checkout"):
-        prune()
     assert torch.cuda.empty_cache is original
