@@ -19,7 +19,6 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.runner import checkout_filters, checkout_loss, checkout_noise, checkout_rotations
 from lapgs_plugin.runner.context import CheckoutContext
 from lapgs_plugin.runner.installed_packages import require_matching_rasterizer
-from lapgs_plugin.runner.kept_memory import keeping_memory
 from lapgs_plugin.runner.late_numbers import reading_late
 from lapgs_plugin.runner.running_stage import RunningStage
 from lapgs_plugin.runner.step_clock import timing_replacements
@@ -225,8 +224,7 @@ class StageReplacements:
                 )
                 return None
             try:
-                with keeping_memory():
-                    result = original(gaussians, *args, **kwargs)
+                result = original(gaussians, *args, **kwargs)
             finally:
                 self._controlling = not outermost
             if outermost and stage is not None and stage.trains(gaussians):
