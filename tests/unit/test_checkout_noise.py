@@ -112,6 +112,11 @@ def test_where_the_share_is_defined(load_module: Callable[[str], ModuleType], sh
         ("S = A @ A.transpose(1, 2)", "S = A.transpose(1, 2) @ A"),
         ("S = A @ A.transpose(1, 2)", "S = A @ A.transpose(1, 2)\n                kept = S"),
         ("model._xyz.add_(e)", "model._xyz.add_(e)\n                kept = e.norm()"),
+        ("model._xyz.add_(e)", "model._xyz.add_(e)\n                del A, e"),
+        ("model._xyz.add_(e)", "model._xyz.add_(e)\n                e += 1"),
+        ("* args.lr * rate", "* S.ndim * rate"),
+        ("args.lr * rate", "args.lr * min([args], key=str).lr"),
+        ("k=100, x0", "k=100, *, x0"),
         ("model._xyz.add_(e)", "model._xyz.sub_(e)"),
         ("model._xyz.add_(e)", "model._xyz.add_(e.clone())"),
         ("torch.randn_like(model._xyz)", "torch.rand_like(model._xyz)"),
@@ -131,6 +136,16 @@ def test_what_differs_stays(
 ) -> None:
     assert written in LOOP
     module = load_module(LOOP.replace(written, instead))
+    training = checkout_noise.in_one_kernel(module.training)
+    assert torch.equal(_trained(module, training), _trained(module, module.training))
+    assert shaken == []
+
+
+def test_share_whose_default_can_change(load_module: Callable[[str], ModuleType], shaken: list[float]) -> None:
+    listed = (
+        FADE.replace("                ", "", 1).replace("\n                    ", "\n    ").replace("0.995", "[0.995]")
+    )
+    module = load_module(listed.replace("(x0 - x)", "(x0[0] - x)") + LOOP.replace(FADE, ""))
     training = checkout_noise.in_one_kernel(module.training)
     assert torch.equal(_trained(module, training), _trained(module, module.training))
     assert shaken == []
