@@ -37,7 +37,10 @@ ACTIVATIONS = {"scaling_activation": torch.exp, "opacity_activation": torch.sigm
 VARIANCE = 0.2
 """Variance of a filter in pixels of the camera with the largest focal length."""
 LARGEST_DIFFERENCE = 1e-4
-"""Largest difference from the checkout's results, relative to the largest of them, that counts as rounding."""
+"""Largest difference from the checkout's results that counts as rounding, relative to each value.
+
+That of gradients, which it may compute as differences of larger numbers, is relative to the largest.
+"""
 
 
 def replacements(model: type, consumer: str) -> list[Replacement]:
@@ -47,8 +50,12 @@ def replacements(model: type, consumer: str) -> list[Replacement]:
         OPACITIES: lambda original: _property(model, original, _our_opacities),
         COMPUTE: computing,
     }
-    found = [replacement for name, make in makers.items() for replacement in of_class(model, name, make, consumer)]
-    return [replacement for replacement in found if _is_plain(vars(replacement.owner)[replacement.name])]
+    return [
+        replacement
+        for name, make in makers.items()
+        for replacement in of_class(model, name, make, consumer)
+        if _is_plain(vars(replacement.owner)[name])
+    ]
 
 
 def _is_plain(member: Any) -> bool:
@@ -165,13 +172,14 @@ def _has_kernels(tensor: Tensor) -> bool:
 def _property_difference(
     model: type, getter: Callable[[Any], Any], ours: Callable[[Any], Tensor], device: torch.device
 ) -> float:
-    """Return how far a property is from ours for some Gaussians, and its gradients.
+    """Return how far a property is from ours for Gaussians of many sizes, and its gradients.
 
     It is read of an object that has its class's activations and nothing else.
     """
     names = "get_scaling", "get_opacity"
     own = {name: getattr_static(model, name) for name in names if hasattr(model, name)}
     logits, log_scales, filters = examples(device)
+    log_scales, filters = 3 * log_scales - 3, filters**3  # a bound on either is a difference
     weights = torch.cos(torch.arange(len(logits), device=device))[:, None]
     results = []
     for read in (ours, getter):
@@ -184,7 +192,9 @@ def _property_difference(
             return math.inf  # it does more
         gradients = torch.autograd.grad((output * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
         results.append((output, *gradients))
-    return largest(map(_apart, *results))
+    ours_and_theirs = zip(*results, strict=True)
+    outputs = next(ours_and_theirs)
+    return largest([_apart(*outputs), *(_apart(one, other, other.abs().max()) for one, other in ours_and_theirs)])
 
 
 def _filter_difference(original: Callable[..., Any], said: list[str], device: torch.device) -> float:
@@ -192,7 +202,7 @@ def _filter_difference(original: Callable[..., Any], said: list[str], device: to
     all_means, rows = seen_from(device)
     cameras = [_Camera.of(row) for row in rows.cpu().numpy().astype(np.float64)]
     differences, texts = [], []
-    for means in (all_means, all_means[: len(all_means) // 2]):
+    for means in (all_means, all_means[: len(all_means) // 2], 100 * all_means):
         probe = SimpleNamespace(get_xyz=means, _xyz=means)
         before = set(vars(probe))
         with redirect_stdout(io.StringIO()) as text:
@@ -224,8 +234,8 @@ class _Camera(NamedTuple):
         return cls(row[:9].reshape(3, 3), row[9:12], float(fx), float(fy), int(width), int(height))
 
 
-def _apart(one: Tensor, other: Tensor) -> Tensor:
-    """Return the largest difference of two tensors, relative to the largest value; inf for other shapes."""
+def _apart(one: Tensor, other: Tensor, scale: Tensor | None = None) -> Tensor:
+    """Return the largest difference of two tensors, relative to a scale or else each value; inf for other shapes."""
     if one.shape != other.shape:
         return one.new_tensor(torch.inf)
-    return (one - other).abs().max() / other.abs().max().clamp_min(1e-9)
+    return ((one - other).abs() / (other.abs() if scale is None else scale).clamp_min(1e-30)).max()

@@ -89,7 +89,7 @@ def _agree(build: Any, fading: Any, device: torch.device) -> bool:
 def _difference(build: Callable[..., Tensor], fading: Callable[..., Tensor], device: torch.device) -> float:
     """Return how far the functions are from ours for some Gaussians."""
     scales, quaternions = examples(device)
-    left = torch.linspace(0.9, 1.0, 300, device=device)
+    left = torch.linspace(0.0, 1.0, 3000, device=device)
     share = torch.sigmoid(SHARPNESS * (left - (1.0 - FAINT)))
     matrices = build(scales, quaternions) - scaled_rotations_torch(scales, quaternions)
     return largest([matrices.abs(), (fading(left) - share).abs()])

@@ -150,7 +150,11 @@ def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: li
     [
         ("self.get_scaling ** 2 + self.filter_3D ** 2)", "self.get_scaling ** 2 + 2 * self.filter_3D ** 2)", "scales"),
         ("self.get_scaling ** 2 + self.filter_3D ** 2)", "self.get_scaling ** 2 + self.floor)", "scales"),
+        ("self.filter_3D ** 2) ** 0.5", "self.filter_3D ** 2).clamp(min=1e-6) ** 0.5", "scales"),
         ("* share", "* share.detach()", "opacities"),
+        ("* share", "* share.clamp(min=0.005)", "opacities"),
+        ("before = self.get_scaling ** 2", "before = self.get_scaling.clamp(max=30.0) ** 2", "opacities"),
+        ("here & (z < best), z, best", "here & (z < best), z.clamp(max=50.0), best", "filters"),
         ("prod(1, keepdim=True) ** 0.5", "prod(1, keepdim=True)", "opacities"),
         ("u.abs() <= 0.65", "u.abs() <= 0.6", "filters"),
         ("v.abs() <= 0.65", "v.abs() <= 0.7", "filters"),

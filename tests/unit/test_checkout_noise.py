@@ -123,6 +123,7 @@ def test_where_the_share_is_defined(load_module: Callable[[str], ModuleType], sh
         ("1 - model.get_opacity", "model.get_opacity"),
         ("fade(1 - model.get_opacity)", "fade(1 - model.get_opacity, 50)"),
         ("k=100", "k=50"),
+        ("(x0 - x)))", "(x0 - x))) + (x < 0.5)"),
         ("torch.exp(k *", "torch.exp(ONE * k *"),
         ("x0=0.995", "x0=0.99"),
         ("* s[:, None, :]", "* s[:, :, None]"),
