@@ -84,8 +84,8 @@ def _agreed(colors: Tensor, squares: Tensor) -> float | None:
         return None
     half = len(colors) // 2
     parts = slice(0, None, 2), slice(1, None, 2), slice(0, half), slice(half, None)
-    each = [_falloff(colors[part], squares[part]) for part in parts]
-    return whole if all(AGREED * whole <= part <= whole / AGREED for part in each) else None
+    falloffs = [_falloff(colors[part], squares[part]) for part in parts]
+    return whole if all(AGREED * whole <= falloff <= whole / AGREED for falloff in falloffs) else None
 
 
 def _falloff(colors: Tensor, squares: Tensor) -> float:
