@@ -86,6 +86,7 @@ def test_falloff_of_a_camera_is_measured_for_all_of_its_views() -> None:
     [
         lambda scene: scene,  # no falloff
         lambda scene: with_falloff(scene, -STOPS),  # no lens brightens the corners
+        lambda scene: with_falloff(scene, 10 * STOPS),  # or darkens them so much
         lambda scene: with_falloff(scene, STOPS, every=2),  # parts of the photos do not agree
         lambda scene: replace(with_falloff(scene, STOPS), train=with_falloff(scene, STOPS).train[:15]),
         lambda scene: replace(with_falloff(scene, STOPS), colors=torch.full_like(scene.colors, 0.5)),  # random points
