@@ -47,7 +47,7 @@ class NoiseStatements(Change):
     """
 
     def __init__(self, function: ast.FunctionDef) -> None:
-        self._loads = _loads([function])
+        self._uses = _uses([function])
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         """Return the node with noise in the places of its statements."""
@@ -74,15 +74,14 @@ class NoiseStatements(Change):
         return statements
 
     def _are_alone(self, variables: set[str], statements: Sequence[ast.stmt]) -> bool:
-        """Return whether no other statement of the function reads the variables."""
-        within = _loads(statements)
-        return all(self._loads[name] == within[name] for name in variables)
+        """Return whether no other statement of the function reads, sets or deletes the variables."""
+        within = _uses(statements)
+        return all(self._uses[name] == within[name] for name in variables)
 
 
-def _loads(nodes: Sequence[ast.AST]) -> Counter[str]:
-    """Return how often variables are read."""
-    names = (inner for node in nodes for inner in ast.walk(node) if isinstance(inner, ast.Name))
-    return Counter(name.id for name in names if isinstance(name.ctx, ast.Load))
+def _uses(nodes: Sequence[ast.AST]) -> Counter[str]:
+    """Return how often variables are read, set or deleted."""
+    return Counter(inner.id for node in nodes for inner in ast.walk(node) if isinstance(inner, ast.Name))
 
 
 def _is_plain(function: ast.FunctionDef) -> bool:
@@ -106,9 +105,7 @@ def _noise(statements: Sequence[ast.stmt]) -> _Noise | None:
         case _:
             return None
     drawn, *factors = _factors(product)
-    if len(factors) < 1 or not all(
-        isinstance(factor, (ast.Name, ast.Attribute, ast.Constant)) for factor in factors[1:]
-    ):
+    if not factors or not all(map(_is_read, factors[1:])):
         return None
     match factors[0]:
         case ast.Call(ast.Name() as fading, [of_opacities], []):
@@ -124,9 +121,17 @@ def _noise(statements: Sequence[ast.stmt]) -> _Noise | None:
         f"{shaken}.add_({noise})",
     ]
     names = {matrices, covariances, noise}
-    if written != expected or len(names | {build.id, model.id, fading.id}) != len(names) + 3:
+    others = {build.id, model.id, fading.id}
+    if written != expected or len(names | others) != len(names) + 3 or names & _uses(factors[1:]).keys():
         return None
     return _Noise([build, fading, model, *factors[1:]], names)
+
+
+def _is_read(factor: ast.expr) -> bool:
+    """Return whether a factor is a constant, a variable or an attribute of one, so that reading it does nothing."""
+    while isinstance(factor, ast.Attribute):
+        factor = factor.value
+    return isinstance(factor, (ast.Name, ast.Constant))
 
 
 def _factors(product: ast.expr) -> list[ast.expr]:

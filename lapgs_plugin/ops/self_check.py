@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -66,6 +67,12 @@ def _in_one_line(error: BaseException) -> str:
 def matches_reference(fallback: str, limit: float) -> Callable[[Difference], SelfCheck]:
     """Make a `SelfCheck` of a function that returns the largest difference between kernels and PyTorch."""
     return lambda difference: SelfCheck(difference, fallback, limit)
+
+
+def is_rows(value: Any, columns: int) -> bool:
+    """Return whether a value is a tensor that kernels read: contiguous rows of float32, not empty."""
+    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
+    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
 
 
 def largest(values: Iterable[Tensor]) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import cache, partial, wraps
 from inspect import getattr_static
+from numbers import Real
 from types import FunctionType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.ops import smoothing_filter
-from lapgs_plugin.ops.self_check import SelfCheck, largest
+from lapgs_plugin.ops.self_check import SelfCheck, is_rows, largest
 from lapgs_plugin.ops.smoothing_filter.in_torch import CameraRow, seen_from
 from lapgs_plugin.ops.smoothing_filter.in_torch import gaussians as examples
 
@@ -36,7 +37,10 @@ ACTIVATIONS = {"scaling_activation": torch.exp, "opacity_activation": torch.sigm
 VARIANCE = 0.2
 """Variance of a filter in pixels of the camera with the largest focal length."""
 LARGEST_DIFFERENCE = 1e-4
-"""Largest difference from the checkout's results, relative to the largest of them, that counts as rounding."""
+"""Largest difference from the checkout's results that counts as rounding, relative to each value.
+
+That of gradients, which it may compute as differences of larger numbers, is relative to the largest.
+"""
 
 
 def replacements(model: type, consumer: str) -> list[Replacement]:
@@ -46,14 +50,23 @@ def replacements(model: type, consumer: str) -> list[Replacement]:
         OPACITIES: lambda original: _property(model, original, _our_opacities),
         COMPUTE: computing,
     }
-    found = [replacement for name, make in makers.items() for replacement in of_class(model, name, make, consumer)]
-    return [r for r in found if isinstance(vars(r.owner)[r.name], FunctionType if r.name == COMPUTE else property)]
+    return [
+        replacement
+        for name, make in makers.items()
+        for replacement in of_class(model, name, make, consumer)
+        if _is_plain(vars(replacement.owner)[name])
+    ]
+
+
+def _is_plain(member: Any) -> bool:
+    """Return whether a class's member is a method, or a property that is read by one."""
+    return isinstance(member.fget if isinstance(member, property) else member, FunctionType)
 
 
 def _property(model: type, original: property, ours: Callable[[Any], Tensor]) -> property:
     """Return the replacement of a property of models; where it differs from ours, it is read itself."""
     getter = original.fget
-    assert getter is not None, "properties of the family are read"
+    assert getter is not None, "as it is plain"
     name = f"{getter.__module__}.{getter.__qualname__} of the checkout"
     agrees = cache(SelfCheck(partial(_property_difference, model, getter, ours), name, LARGEST_DIFFERENCE).passes_on)
 
@@ -73,15 +86,14 @@ def computing(original: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(original)
     def compute(gaussians: Any, *args: Any, **kwargs: Any) -> Any:
-        means: Any = getattr(gaussians, "_xyz", None)
-        cameras = [*args, *kwargs.values()]
-        if len(cameras) == 1 and _is_rows(means, 3) and _has_kernels(means) and agrees(means.device):
-            filters = _filters(means.detach(), cameras[0])
-            if filters is not None:
-                print("".join(said), end="")
-                setattr(gaussians, FILTERS, filters)
-                return None
-        return original(gaussians, *args, **kwargs)
+        filters, cameras = None, [*args, *kwargs.values()]
+        if len(cameras) == 1 and _has_centers(gaussians) and agrees(gaussians._xyz.device):
+            filters = _filters(gaussians._xyz.detach(), cameras[0])
+        if filters is None:
+            return original(gaussians, *args, **kwargs)
+        print("".join(said), end="")
+        setattr(gaussians, FILTERS, filters)
+        return None
 
     return compute
 
@@ -107,7 +119,7 @@ def _filters(means: Tensor, cameras: Any) -> Tensor | None:
     if not rows:
         return None
     table = torch.tensor([row.numbers for row in rows], dtype=torch.float32)
-    depths = smoothing_filter.nearest_depths(means.contiguous(), table.to(means.device))
+    depths = smoothing_filter.nearest_depths(means, table.to(means.device))
     seen = depths < torch.inf
     if not bool(seen.any()):
         return None
@@ -121,14 +133,23 @@ def _rows(cameras: Any) -> list[CameraRow]:
     rows = []
     for camera in cameras if isinstance(cameras, Sequence) else ():
         numbers = [getattr(camera, name, None) for name in ("focal_x", "focal_y", "image_width", "image_height")]
-        matrix, shift = getattr(camera, "R", None), getattr(camera, "T", None)
-        if not (isinstance(matrix, np.ndarray) and isinstance(shift, np.ndarray)) or None in numbers:
+        matrix: Any = getattr(camera, "R", None)
+        shift: Any = getattr(camera, "T", None)
+        if not (_is_array(matrix, (3, 3)) and _is_array(shift, (3,)) and all(isinstance(n, Real) for n in numbers)):
             return []
-        if (matrix.shape, shift.shape) != ((3, 3), (3,)):
-            return []
-        fx, fy, width, height = map(float, numbers)  # type: ignore[arg-type]  # None is not among them
+        fx, fy, width, height = map(float, numbers)  # type: ignore[arg-type]  # they are real numbers
         rows.append(CameraRow(tuple(matrix.ravel().tolist()), tuple(shift.tolist()), (fx, fy), (width, height)))
     return rows
+
+
+def _is_array(value: Any, shape: tuple[int, ...]) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind == "f"
+
+
+def _has_centers(gaussians: Any) -> bool:
+    """Return whether kernels read a model's centres, which are its parameter and nothing else."""
+    means: Any = getattr(gaussians, "_xyz", None)
+    return is_rows(means, 3) and _has_kernels(means) and getattr(gaussians, "get_xyz", None) is means
 
 
 def _fits(gaussians: Any) -> bool:
@@ -137,16 +158,10 @@ def _fits(gaussians: Any) -> bool:
         return False
     filters: Any = getattr(gaussians, FILTERS, None)
     log_scales, logits = gaussians._scaling, gaussians._opacity
-    if not (_is_rows(log_scales, 3) and _is_rows(logits, 1) and _is_rows(filters, 1)):
+    if not (is_rows(log_scales, 3) and is_rows(logits, 1) and is_rows(filters, 1)):
         return False
     fit = len(log_scales) == len(logits) and len(filters) in (1, len(logits)) and not filters.requires_grad
     return fit and log_scales.device == logits.device == filters.device
-
-
-def _is_rows(value: Any, columns: int) -> bool:
-    """Return whether a value is one that kernels read: contiguous rows of float32."""
-    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
-    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
 
 
 def _has_kernels(tensor: Tensor) -> bool:
@@ -157,13 +172,14 @@ def _has_kernels(tensor: Tensor) -> bool:
 def _property_difference(
     model: type, getter: Callable[[Any], Any], ours: Callable[[Any], Tensor], device: torch.device
 ) -> float:
-    """Return how far a property is from ours for some Gaussians, and its gradients.
+    """Return how far a property is from ours for Gaussians of many sizes, and its gradients.
 
     It is read of an object that has its class's activations and nothing else.
     """
     names = "get_scaling", "get_opacity"
     own = {name: getattr_static(model, name) for name in names if hasattr(model, name)}
     logits, log_scales, filters = examples(device)
+    log_scales, filters = 3 * log_scales - 3, filters**3  # a bound on either is a difference
     weights = torch.cos(torch.arange(len(logits), device=device))[:, None]
     results = []
     for read in (ours, getter):
@@ -176,23 +192,29 @@ def _property_difference(
             return math.inf  # it does more
         gradients = torch.autograd.grad((output * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
         results.append((output, *gradients))
-    return largest(map(_apart, *results))
+    ours_and_theirs = zip(*results, strict=True)
+    outputs = next(ours_and_theirs)
+    return largest([_apart(*outputs), *(_apart(one, other, other.abs().max()) for one, other in ours_and_theirs)])
 
 
 def _filter_difference(original: Callable[..., Any], said: list[str], device: torch.device) -> float:
     """Return how far filters are from ours for some centres and cameras, and note what is printed meanwhile."""
-    means, rows = seen_from(device)
+    all_means, rows = seen_from(device)
     cameras = [_Camera.of(row) for row in rows.cpu().numpy().astype(np.float64)]
-    probe = SimpleNamespace(get_xyz=means, _xyz=means)
-    before = set(vars(probe))
-    with redirect_stdout(io.StringIO()) as text:
-        returned = original(probe, cameras)
-    if returned is not None or vars(probe).keys() != before | {FILTERS}:
-        return math.inf  # it does more
-    said[:] = [text.getvalue()]
-    ours = _filters(means, cameras)
-    assert ours is not None, "they are made to be seen"
-    return largest([_apart(ours, getattr(probe, FILTERS))])
+    differences, texts = [], []
+    for means in (all_means, all_means[: len(all_means) // 2], 100 * all_means):
+        probe = SimpleNamespace(get_xyz=means, _xyz=means)
+        before = set(vars(probe))
+        with redirect_stdout(io.StringIO()) as text:
+            returned = original(probe, cameras)
+        texts.append(text.getvalue())
+        if returned is not None or vars(probe).keys() != before | {FILTERS} or texts[0] != texts[-1]:
+            return math.inf  # it does more, or tells of the centres
+        ours = _filters(means, cameras)
+        assert ours is not None, "they are made to be seen"
+        differences.append(_apart(ours, getattr(probe, FILTERS)))
+    said[:] = texts[:1]
+    return largest(differences)
 
 
 class _Camera(NamedTuple):
@@ -212,8 +234,8 @@ class _Camera(NamedTuple):
         return cls(row[:9].reshape(3, 3), row[9:12], float(fx), float(fy), int(width), int(height))
 
 
-def _apart(one: Tensor, other: Tensor) -> Tensor:
-    """Return the largest difference of two tensors, relative to the largest value; inf for other shapes."""
+def _apart(one: Tensor, other: Tensor, scale: Tensor | None = None) -> Tensor:
+    """Return the largest difference of two tensors, relative to a scale or else each value; inf for other shapes."""
     if one.shape != other.shape:
         return one.new_tensor(torch.inf)
-    return (one - other).abs().max() / other.abs().max().clamp_min(1e-9)
+    return ((one - other).abs() / (other.abs() if scale is None else scale).clamp_min(1e-30)).max()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from types import CodeType
+from types import FunctionType
 from typing import Any
 
 import torch
@@ -20,7 +20,7 @@ from lapgs_plugin.ops import position_noise
 from lapgs_plugin.ops.position_noise.in_torch import FAINT, SHARPNESS
 from lapgs_plugin.ops.scaled_rotations import examples
 from lapgs_plugin.ops.scaled_rotations.in_torch import scaled_rotations_torch
-from lapgs_plugin.ops.self_check import SelfCheck, largest
+from lapgs_plugin.ops.self_check import SelfCheck, is_rows, largest
 
 LARGEST_DIFFERENCE = 1e-4
 """Largest difference of scaled rotations, for scales below 4, and of the noise's share that counts as rounding."""
@@ -45,14 +45,14 @@ def _shake(build: Any, fading: Any, model: Any, *factors: Any) -> bool:
         factors: numbers.
     """
     means: Any = getattr(model, "_xyz", None)
-    if torch.is_grad_enabled() or not _is_rows(means, 3) or not _has_kernels(means):
+    if torch.is_grad_enabled() or not is_rows(means, 3) or not _has_kernels(means):
         return False
     if not all(isinstance(factor, (int, float)) for factor in factors) or not _agree(build, fading, means.device):
         return False
     tensors = model.get_scaling, model.get_rotation, model.get_opacity
     n, device = len(means), means.device
     if not all(
-        _is_rows(tensor, columns) and len(tensor) == n and tensor.device == device
+        is_rows(tensor, columns) and len(tensor) == n and tensor.device == device
         for tensor, columns in zip(tensors, (3, 4, 1), strict=True)
     ):
         return False
@@ -63,12 +63,6 @@ def _shake(build: Any, fading: Any, model: Any, *factors: Any) -> bool:
     return True
 
 
-def _is_rows(value: Any, columns: int) -> bool:
-    """Return whether a value is one that kernels read: contiguous rows of float32."""
-    is_float = isinstance(value, Tensor) and value.dtype == torch.float32 and value.ndim == 2
-    return is_float and value.shape[1] == columns and value.is_contiguous() and len(value) > 0
-
-
 def _has_kernels(means: Tensor) -> bool:
     """Return whether a kernel shakes positions; on a CPU the checkout's own statements do."""
     return position_noise.given_noise_works(means)
@@ -76,12 +70,14 @@ def _has_kernels(means: Tensor) -> bool:
 
 def _agree(build: Any, fading: Any, device: torch.device) -> bool:
     """Return whether two functions of a checkout are those of our kernel; one may be defined in each iteration."""
-    code: CodeType | None = getattr(fading, "__code__", None)
-    if code is None or fading.__closure__ is not None:
+    if not isinstance(build, FunctionType) or not isinstance(fading, FunctionType) or fading.__closure__ is not None:
+        return False
+    code, defaults = fading.__code__, fading.__defaults__ or ()
+    if fading.__kwdefaults__ or not all(isinstance(default, (int, float)) for default in defaults):
         return False
     if any(name != "torch" and name in fading.__globals__ for name in code.co_names):  # which may change
         return False
-    key = build, code, fading.__defaults__, device
+    key = build, code, defaults, device
     if key not in _agreeing:
         check = SelfCheck(
             partial(_difference, build, fading), "noise of positions as in the checkout", LARGEST_DIFFERENCE
@@ -93,7 +89,7 @@ def _agree(build: Any, fading: Any, device: torch.device) -> bool:
 def _difference(build: Callable[..., Tensor], fading: Callable[..., Tensor], device: torch.device) -> float:
     """Return how far the functions are from ours for some Gaussians."""
     scales, quaternions = examples(device)
-    left = torch.linspace(0.9, 1.0, 300, device=device)
+    left = torch.linspace(0.0, 1.0, 3000, device=device)
     share = torch.sigmoid(SHARPNESS * (left - (1.0 - FAINT)))
     matrices = build(scales, quaternions) - scaled_rotations_torch(scales, quaternions)
     return largest([matrices.abs(), (fading(left) - share).abs()])

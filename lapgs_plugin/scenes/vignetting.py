@@ -27,6 +27,8 @@ from lapgs_plugin.scenes.scene import Scene, View
 
 LEAST_FALLOFF = 0.1
 """Least darkening of the corners in stops that is taken."""
+MOST_FALLOFF = 4.0
+"""Most darkening that is taken, more than lenses have."""
 LEAST_PHOTOS = 16
 """Fewest training photos of a camera that is measured."""
 MOST_PHOTOS = 300
@@ -78,12 +80,12 @@ def _squared_radii(camera: Camera, points: Tensor) -> Tensor:
 def _agreed(colors: Tensor, squares: Tensor) -> float | None:
     """Return the falloff of photos if parts of them agree on it, and it is one."""
     whole = _falloff(colors, squares)
-    if not whole <= -LEAST_FALLOFF:
+    if not -MOST_FALLOFF <= whole <= -LEAST_FALLOFF:
         return None
     half = len(colors) // 2
     parts = slice(0, None, 2), slice(1, None, 2), slice(0, half), slice(half, None)
-    each = [_falloff(colors[part], squares[part]) for part in parts]
-    return whole if all(AGREED * whole <= part <= whole / AGREED for part in each) else None
+    falloffs = [_falloff(colors[part], squares[part]) for part in parts]
+    return whole if all(AGREED * whole <= falloff <= whole / AGREED for falloff in falloffs) else None
 
 
 def _falloff(colors: Tensor, squares: Tensor) -> float:

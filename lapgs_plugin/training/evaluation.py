@@ -88,11 +88,12 @@ class StageEvaluation:
 
     @torch.no_grad()
     def _fitted_psnr(self, view: LevelView) -> float:
-        """Return the PSNR of a training view at the stage's size, after a colour fit."""
+        """Return the PSNR of a training view at the stage's size, with its falloff and after a colour fit."""
         run, images = self.run, self.run.images
         camera = at_pose(view, run.poses).camera
         image = run.prepared.rasterizer.render_image(run.model.field, camera, background=run.background)
         composed = add_prediction(image, None if images.predictions is None else images.predictions.get(view.name))
+        composed = vignette(composed, [run.falloffs.get(view.name, 0.0)])
         photo, _ = images.photos.get(view.name)
         return color_fitted_psnr(composed, photo, images.photos.get_weights(view.name))
 

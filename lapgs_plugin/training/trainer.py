@@ -212,12 +212,10 @@ class Trainer:
 
     def _run_stage(self, stage: Stage, checkpoint: dict[str, Any] | None, stop: StopRequest) -> None:
         """Train and archive one stage."""
-        gains = self._gains(stage, checkpoint)
-        if gains is not None:
-            self.prepared = self.prepared.lasting(stage.level, gains.planned)
+        # A run that was stopped with --stop auto may continue with --time.
         for decided in () if checkpoint is None else filter(None, (checkpoint["gains"], checkpoint["budget"])):
             self.prepared = self.prepared.lasting(stage.level, decided["planned"])
-        stage = self.prepared.plan[stage.level]
+        stage, gains = self.prepared.plan[stage.level], self._gains(stage, checkpoint)
         budget = self._budget(stage, checkpoint)
         prepared, aside = self.prepared, self.prepared.aside
         before = prepared.record_to_extend(stage)

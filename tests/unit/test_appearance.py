@@ -24,7 +24,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import GRIDS
 from lapgs_plugin.runs.tensors import write_tensors
 from lapgs_plugin.scenes.scene import Scene
-from lapgs_plugin.stages.appearance import FIRST_RATE, LAST_RATE, ViewGrids, identities
+from lapgs_plugin.stages.appearance import FIRST_RATE, LAST_RATE, ViewAppearance, ViewColors, ViewGrids, identities
 from lapgs_plugin.training.settings import TrainSettings
 from tests.training_runs import StopAt, resume, train
 from tests.training_scene import panned_scene, ring_scene
@@ -123,6 +123,22 @@ def test_grids_learn_tones_of_single_photos_and_the_mean_at_each_brightness_stay
     assert all(late < 0.9 * early for early, late in zip(before, after, strict=True)), (before, after)
     common = grids.transforms.detach().mean(dim=(0, 1, 2))
     torch.testing.assert_close(common, torch.eye(3, 4).flatten().expand(8, 12), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("kind", [ViewGrids, ViewColors])
+def test_gradients_of_views_are_added_up_also_of_one_that_is_twice_in_a_launch(kind: type[ViewAppearance]) -> None:
+    images, start = random(3, 3, 20, 30).float(), kind.uniform(identities(4), (64, 48))
+    learned = kind.create(["a", "b", "c", "d"], start, torch.device("cpu"), 0, 8)
+    leaf = start.clone().requires_grad_()
+    operation = slice_grids if kind is ViewGrids else transform_colors
+    for names, of in ((("b", "d", "b"), [1, 3, 1]), (("a", "b", "d"), [0, 1, 3])):
+        with torch.no_grad():  # as scores of Gaussians look at views between launches
+            learned.apply(["c"], images[0])
+        learned.apply(names, images).square().sum().backward()
+        operation(images, leaf[of]).square().sum().backward()
+    assert leaf.grad is not None
+    torch.testing.assert_close(learned.transforms.grad, leaf.grad, atol=0, rtol=1e-5)  # equal
+    assert not learned.transforms.grad[2].any()
 
 
 def test_what_all_photos_share_over_the_image_stays_and_what_they_share_at_a_brightness_goes() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -18,11 +20,16 @@ from lapgs_plugin.runner import checkout_filters
 MODEL = """
 import torch
 
+CALLS = []
+
 class Model:
     def __init__(self, xyz, logits, log_scales, filters):
         self._xyz, self._opacity, self._scaling, self.filter_3D = xyz, logits, log_scales, filters
         self.scaling_activation, self.opacity_activation = torch.exp, torch.sigmoid
-        self.calls = []
+
+    @property
+    def get_xyz(self):
+        return self._xyz
 
     @property
     def get_scaling(self):
@@ -30,12 +37,12 @@ class Model:
 
     @property
     def get_scaling_with_3D_filter(self):
-        self.note("scales")
+        CALLS.append("scales")
         return (self.get_scaling ** 2 + self.filter_3D ** 2) ** 0.5
 
     @property
     def get_opacity_with_3D_filter(self):
-        self.note("opacities")
+        CALLS.append("opacities")
         before = self.get_scaling ** 2
         share = (before / (before + self.filter_3D ** 2)).prod(1, keepdim=True) ** 0.5
         return self.opacity_activation(self._opacity) * share
@@ -43,7 +50,7 @@ class Model:
     @torch.no_grad()
     def compute_3D_filter(self, cameras):
         print("Filters")
-        self.note("filters")
+        CALLS.append("filters")
         best = torch.full((len(self._xyz),), 100000.0)
         found = torch.zeros(len(best), dtype=torch.bool)
         for camera in cameras:
@@ -56,15 +63,7 @@ class Model:
             found |= here
         best[~found] = best[found].max()
         self.filter_3D = (best * 0.2 ** 0.5 / max(camera.focal_x for camera in cameras))[:, None]
-
-    def note(self, name):
-        getattr(self, "calls", []).append(name)
 """
-
-
-def _plain(text: str) -> str:
-    """Return the model without its list of calls, which only tests can see."""
-    return "\n".join(line for line in text.split("\n") if "self.note(" not in line)
 
 
 @pytest.fixture
@@ -104,7 +103,7 @@ def _cameras(count: int = 6) -> list[Any]:
     return cameras
 
 
-def _results(module: ModuleType, *, replaced: bool) -> tuple[list[Tensor], list[str]]:
+def _results(module: ModuleType, *, replaced: bool) -> list[Tensor]:
     model, values = _model(module), []
     replacements = checkout_filters.replacements(module.Model, "the test") if replaced else []
     with Attachment(replacements):
@@ -114,17 +113,17 @@ def _results(module: ModuleType, *, replaced: bool) -> tuple[list[Tensor], list[
             values += [opacities, scales, *torch.autograd.grad(total, [model._opacity, model._scaling])]
             model.compute_3D_filter(cameras=_cameras())
             values.append(model.filter_3D)
-    return values, model.calls
+    return values
 
 
 def test_ours_do_the_same(
     load_module: Callable[[str], ModuleType], on_gpu: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    module = load_module(_plain(MODEL))
-    expected, _ = _results(module, replaced=False)
+    module = load_module(MODEL)
+    expected = _results(module, replaced=False)
     printed = capsys.readouterr().out
     assert on_gpu == []
-    values, _ = _results(module, replaced=True)
+    values = _results(module, replaced=True)
     assert capsys.readouterr().out == printed == 2 * "Filters\n"
     assert sorted(set(on_gpu)) == ["filtered_opacities", "filtered_scales", "nearest_depths"]
     for ours, theirs in zip(values, expected, strict=True):
@@ -135,7 +134,7 @@ def test_ours_do_the_same(
 
 def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: list[str]) -> None:
     """As models of archived fields have it, whose filters are in their scales."""
-    module = load_module(_plain(MODEL))
+    module = load_module(MODEL)
     model = _model(module)
     model.filter_3D = torch.full((1, 1), 0.3)
     expected = model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter
@@ -151,7 +150,11 @@ def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: li
     [
         ("self.get_scaling ** 2 + self.filter_3D ** 2)", "self.get_scaling ** 2 + 2 * self.filter_3D ** 2)", "scales"),
         ("self.get_scaling ** 2 + self.filter_3D ** 2)", "self.get_scaling ** 2 + self.floor)", "scales"),
+        ("self.filter_3D ** 2) ** 0.5", "self.filter_3D ** 2).clamp(min=1e-6) ** 0.5", "scales"),
         ("* share", "* share.detach()", "opacities"),
+        ("* share", "* share.clamp(min=0.005)", "opacities"),
+        ("before = self.get_scaling ** 2", "before = self.get_scaling.clamp(max=30.0) ** 2", "opacities"),
+        ("here & (z < best), z, best", "here & (z < best), z.clamp(max=50.0), best", "filters"),
         ("prod(1, keepdim=True) ** 0.5", "prod(1, keepdim=True)", "opacities"),
         ("u.abs() <= 0.65", "u.abs() <= 0.6", "filters"),
         ("v.abs() <= 0.65", "v.abs() <= 0.7", "filters"),
@@ -162,6 +165,7 @@ def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: li
         ('print("Filters")', "self.count = len(cameras)", "filters"),
         ("before = self.get_scaling ** 2", "before = self.kept = self.get_scaling ** 2", "opacities"),
         ("best[~found] = best[found].max()", "best[~found] = best[found].mean()", "filters"),
+        ('print("Filters")', 'print("Filters of", len(self.get_xyz))', "filters"),
     ],
 )
 def test_what_differs_stays(
@@ -169,7 +173,7 @@ def test_what_differs_stays(
 ) -> None:
     names = {"scales": "filtered_scales", "opacities": "filtered_opacities", "filters": "nearest_depths"}
     assert written in MODEL
-    module = load_module(_plain(MODEL.replace(written, instead)))
+    module = load_module(MODEL.replace(written, instead))
     module.Model.floor = 0.25
     model = _model(module)
     cameras = [SimpleNamespace(**vars(camera), sharp=True) for camera in _cameras()]
@@ -183,38 +187,69 @@ def test_what_differs_stays(
     assert set(on_gpu) == {name for key, name in names.items() if key != unreplaced}
 
 
-@pytest.mark.parametrize("kind", ["cpu", "activation", "no rows", "strided", "none seen", "other cameras"])
-def test_what_does_not_fit_is_the_checkouts(
+def _read(model: Any) -> None:
+    _ = model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter
+
+
+@pytest.mark.parametrize("kind", ["cpu", "activation", "no rows", "strided", "recorded"])
+def test_properties_of_what_does_not_fit_are_the_checkouts(
     load_module: Callable[[str], ModuleType], on_gpu: list[str], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     module = load_module(MODEL)
-    model, cameras = _model(module), _cameras()
-    if kind == "cpu":
-        monkeypatch.undo()
-    elif kind == "activation":
+    model = _model(module)
+    if kind == "activation":
         model.scaling_activation = model.opacity_activation = torch.nn.functional.softplus
     elif kind == "no rows":
         model.filter_3D = torch.zeros(1)
     elif kind == "strided":
         model._scaling = model._scaling.detach().T.contiguous().T
-    elif kind == "none seen":
-        model._xyz = torch.full_like(model._xyz, torch.nan)
-    else:
-        cameras[0].R = cameras[0].R.tolist()
+    elif kind == "recorded":
+        model.filter_3D.requires_grad_()
     with Attachment(checkout_filters.replacements(module.Model, "the test")):
-        if kind in ("none seen", "other cameras"):
+        for read in (_model(module), _model(module), model):  # the first time it is compared with ours
+            if read is model and kind == "cpu":
+                monkeypatch.undo()
             on_gpu.clear()
-            model.calls.clear()
-            if kind == "none seen":
-                with pytest.raises((RuntimeError, IndexError)):
-                    model.compute_3D_filter(cameras)
-            else:
-                model.compute_3D_filter(cameras)
-            assert model.calls == ["filters"]
-        else:
-            _ = model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter
-            assert model.calls == ["opacities", "scales"]
-            assert on_gpu == []
+            module.CALLS.clear()
+            _read(read)
+            if read is not model:
+                continue
+            assert (module.CALLS, on_gpu) == (["opacities", "scales"], [])
+
+
+@pytest.mark.parametrize("kind", ["none seen", "no array", "numbers", "focal", "two arguments", "other centres"])
+def test_filters_of_what_does_not_fit_are_the_checkouts(
+    load_module: Callable[[str], ModuleType], on_gpu: list[str], kind: str
+) -> None:
+    module = load_module(MODEL.replace("compute_3D_filter(self, cameras)", "compute_3D_filter(self, cameras, _=None)"))
+    model, cameras = _model(module), _cameras()
+    with Attachment(checkout_filters.replacements(module.Model, "the test")):
+        for _ in range(2):
+            module.CALLS.clear()
+            model.compute_3D_filter(cameras)
+        assert module.CALLS == []  # ours does it
+        if kind == "none seen":
+            model._xyz = torch.full_like(model._xyz, torch.nan)
+        elif kind == "no array":
+            cameras[0].R = cameras[0].R.tolist()
+        elif kind == "numbers":
+            cameras[0].T = cameras[0].T.round().astype(int)
+        elif kind == "focal":
+            cameras[0].focal_x = torch.tensor(50.0)
+        elif kind == "other centres":
+            module.Model.get_xyz = property(lambda self: self._xyz + 1)
+        arguments = (cameras, None) if kind == "two arguments" else (cameras,)
+        with pytest.raises((RuntimeError, IndexError)) if kind == "none seen" else nullcontext():
+            model.compute_3D_filter(*arguments)
+    assert module.CALLS == ["filters"]
+
+
+def test_properties_without_a_function_are_left(load_module: Callable[[str], ModuleType]) -> None:
+    module = load_module(MODEL)
+    setattr(module.Model, checkout_filters.SCALES, property(operator.attrgetter("_scaling")))
+    setattr(module.Model, checkout_filters.OPACITIES, property())
+    names = [replacement.name for replacement in checkout_filters.replacements(module.Model, "the test")]
+    assert names == [checkout_filters.COMPUTE]
 
 
 def test_models_without_filters_are_left() -> None:

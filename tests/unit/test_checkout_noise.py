@@ -112,12 +112,18 @@ def test_where_the_share_is_defined(load_module: Callable[[str], ModuleType], sh
         ("S = A @ A.transpose(1, 2)", "S = A.transpose(1, 2) @ A"),
         ("S = A @ A.transpose(1, 2)", "S = A @ A.transpose(1, 2)\n                kept = S"),
         ("model._xyz.add_(e)", "model._xyz.add_(e)\n                kept = e.norm()"),
+        ("model._xyz.add_(e)", "model._xyz.add_(e)\n                del A, e"),
+        ("model._xyz.add_(e)", "model._xyz.add_(e)\n                e += 1"),
+        ("* args.lr * rate", "* S.ndim * rate"),
+        ("args.lr * rate", "args.lr * min([args], key=str).lr"),
+        ("k=100, x0", "k=100, *, x0"),
         ("model._xyz.add_(e)", "model._xyz.sub_(e)"),
         ("model._xyz.add_(e)", "model._xyz.add_(e.clone())"),
         ("torch.randn_like(model._xyz)", "torch.rand_like(model._xyz)"),
         ("1 - model.get_opacity", "model.get_opacity"),
         ("fade(1 - model.get_opacity)", "fade(1 - model.get_opacity, 50)"),
         ("k=100", "k=50"),
+        ("(x0 - x)))", "(x0 - x))) + (x < 0.5)"),
         ("torch.exp(k *", "torch.exp(ONE * k *"),
         ("x0=0.995", "x0=0.99"),
         ("* s[:, None, :]", "* s[:, :, None]"),
@@ -131,6 +137,16 @@ def test_what_differs_stays(
 ) -> None:
     assert written in LOOP
     module = load_module(LOOP.replace(written, instead))
+    training = checkout_noise.in_one_kernel(module.training)
+    assert torch.equal(_trained(module, training), _trained(module, module.training))
+    assert shaken == []
+
+
+def test_share_whose_default_can_change(load_module: Callable[[str], ModuleType], shaken: list[float]) -> None:
+    listed = (
+        FADE.replace("                ", "", 1).replace("\n                    ", "\n    ").replace("0.995", "[0.995]")
+    )
+    module = load_module(listed.replace("(x0 - x)", "(x0[0] - x)") + LOOP.replace(FADE, ""))
     training = checkout_noise.in_one_kernel(module.training)
     assert torch.equal(_trained(module, training), _trained(module, module.training))
     assert shaken == []

@@ -17,7 +17,7 @@ from lapgs_plugin.ops.mixed_sizes import own_part, stack_padded
 from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.rendering.run import run_renderer
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import VIGNETTING
+from lapgs_plugin.runs.layout import CHECKPOINT, VIGNETTING
 from lapgs_plugin.scenes.exposure import sparse_colors
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.scenes.vignetting import measure_vignetting
@@ -86,6 +86,7 @@ def test_falloff_of_a_camera_is_measured_for_all_of_its_views() -> None:
     [
         lambda scene: scene,  # no falloff
         lambda scene: with_falloff(scene, -STOPS),  # no lens brightens the corners
+        lambda scene: with_falloff(scene, 10 * STOPS),  # or darkens them so much
         lambda scene: with_falloff(scene, STOPS, every=2),  # parts of the photos do not agree
         lambda scene: replace(with_falloff(scene, STOPS), train=with_falloff(scene, STOPS).train[:15]),
         lambda scene: replace(with_falloff(scene, STOPS), colors=torch.full_like(scene.colors, 0.5)),  # random points
@@ -129,6 +130,18 @@ def test_levels_are_trained_without_the_falloff_and_held_out_photos_are_compared
     of_scene, of_photos = psnrs["affine"] - psnrs["none"]
     assert of_scene > 10, psnrs  # least seen 17.2
     assert of_photos > 10, psnrs  # least seen 15.6
+
+
+def test_views_set_aside_are_compared_with_it(tmp_path: Path) -> None:
+    scene = panned_scene()
+    settings = TrainSettings(iterations=600, levels=1, appearance="affine", sh_degree=0, stop="auto")
+    psnrs = []
+    for stops in (0.0, STOPS):
+        with pytest.raises(TrainingStoppedError):
+            train(tmp_path / f"{stops}", with_falloff(scene, stops), settings, monitor=StopAt(0, 150))
+        state = torch.load(tmp_path / f"{stops}" / CHECKPOINT, weights_only=True)["state"]
+        psnrs.append(np.mean(state["gains"]["looks"][-1][1]))
+    assert psnrs[1] > psnrs[0]  # errors are darker, too: 36.0 and 30.6 dB seen, 25.0 for images without the falloff
 
 
 def test_stopped_run_continues_with_its_falloff_to_the_same_bits(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def filtered_opacities_torch(logits: Tensor, log_scales: Tensor, filters: Tensor
 
 def nearest_depths_torch(means: Tensor, cameras: Tensor) -> Tensor:
     """Do `nearest_depths` on any device."""
-    nearest = torch.full((len(means),), torch.inf, device=means.device)
+    nearest = means.new_full((len(means),), torch.inf)
     for row in cameras:
         x, y, depth = (means @ row[:9].view(3, 3) + row[9:12]).unbind(1)
         across, down = (

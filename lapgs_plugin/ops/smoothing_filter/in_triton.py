@@ -171,7 +171,7 @@ def filtered_opacities_triton(logits: Tensor, log_scales: Tensor, filters: Tenso
 
 def nearest_depths_triton(means: Tensor, cameras: Tensor) -> Tensor:
     """Do `nearest_depths_torch` for contiguous float32 tensors on one CUDA device, n above 0."""
-    n, depths = len(means), torch.empty(len(means), device=means.device)
+    n, depths = len(means), means.new_empty(len(means))
     bounds = {"nearest": NEAREST, "farthest": FARTHEST, "margin": MARGIN}
     launch(_depths_kernel, (blocks(n, BLOCK),), means, cameras, depths, n, len(cameras), **bounds, block=BLOCK)
     return depths
