@@ -302,7 +302,7 @@ def lit_pixels(camera: Camera) -> Tensor | None:
     """Return the pixels (1, h, w) to which a camera's lens shows something; None if it does to all."""
     if camera.lens is None:
         return None
-    lit = camera.pixel_rays()[1]
+    lit = camera.lit_pixels()
     return None if bool(lit.all()) else lit[None]
 
 

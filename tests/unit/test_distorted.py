@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import SceneError, TrainingStoppedError, UserInputError
-from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.camera import PIXELS_OF_A_STRIP, Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.lens import Lens
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
@@ -89,6 +89,19 @@ def test_rays_of_pixels_are_those_of_colmap(model: str) -> None:
     again = np.asarray(theirs.img_from_cam(rays[seen].numpy()))
     np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-4)  # worst 2e-11
     np.testing.assert_allclose(np.linalg.norm(rays[seen].numpy(), axis=1), 1.0)
+
+
+@pytest.mark.parametrize("model", ["FULL_OPENCV", "OPENCV_FISHEYE"])
+def test_rays_of_large_images_are_those_of_colmap(model: str) -> None:
+    """Images whose rays are sought in several strips of rows."""
+    theirs, ours = of_colmap(model, (301, 263), 180.0)
+    rays, seen = ours.pixel_rays()
+    assert ours.width * ours.height > 2 * PIXELS_OF_A_STRIP
+    assert torch.equal(ours.lit_pixels(), seen)
+    assert seen.double().mean() > 0.95
+    rows, columns = np.nonzero(seen.numpy())
+    again = np.asarray(theirs.img_from_cam(rays[seen].numpy()))
+    np.testing.assert_allclose(again, np.stack([columns, rows], 1) + 0.5, rtol=0, atol=1e-4)  # worst 1e-10
 
 
 def test_level_cameras_keep_the_lens() -> None:
