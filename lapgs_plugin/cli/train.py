@@ -68,7 +68,13 @@ class StartOptions:
         if self.gpus is not None and self.processes is not None:
             raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
         if self.tiling.asked is not None:
-            for name, value in (("--gpus", self.gpus), ("--processes", self.processes), ("--view", self.viewing.view)):
+            asked = {
+                "--gpus": self.gpus,
+                "--processes": self.processes,
+                "--shard": self.shard,
+                "--view": self.viewing.view,
+            }
+            for name, value in asked.items():
                 if value:
                     raise UserInputError(f"{name} with {self.tiling.asked}: not for tiles; leave one out")
         if self.shard:

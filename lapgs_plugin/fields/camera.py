@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -13,6 +14,8 @@ from lapgs_plugin.fields.lens import Lens
 
 ANYWHERE = torch.eye(4)
 """A pose for what does not depend on one."""
+PIXELS_OF_A_STRIP = 1 << 15
+"""Pixels whose rays are sought together: few enough for a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,10 @@ class Camera:
         """Return the directions (h, w, 3) at the pixels' centres, float64, and which have one; see `rays`."""
         return _pixel_rays(replace(self, world_to_camera=ANYWHERE))
 
+    def lit_pixels(self) -> Tensor:
+        """Return the pixels (h, w) that have a ray; the rays are not kept, which take 24 times as much memory."""
+        return _lit_pixels(replace(self, world_to_camera=ANYWHERE))
+
     @property
     def _furthest(self) -> float:
         """Largest distance of a corner of the image from the axis, at depth 1, as if a longer side had both."""
@@ -121,7 +128,21 @@ class Camera:
 @torch.inference_mode(False)  # kept for later calls
 def _pixel_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """Return `Camera.pixel_rays`; cameras with the same lens are equal once all have the pose `ANYWHERE`."""
+    rays, seen = zip(*_rays_of_strips(camera), strict=True)
+    return torch.cat(rays), torch.cat(seen)
+
+
+@lru_cache(maxsize=4)
+@torch.inference_mode(False)
+def _lit_pixels(camera: Camera) -> Tensor:
+    """Return `Camera.lit_pixels`; see `_pixel_rays`."""
+    return torch.cat([seen for _, seen in _rays_of_strips(camera)])
+
+
+def _rays_of_strips(camera: Camera) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield the rays (rows, w, 3) of some rows at a time, and which pixels have one (rows, w)."""
     columns, rows = (torch.arange(side, dtype=torch.float64) + 0.5 for side in camera.size)
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)  # (h, w, 2)
-    rays, seen = camera.rays(pixels.view(-1, 2))
-    return rays.view(*pixels.shape[:2], 3), seen.view(pixels.shape[:2])
+    for strip in torch.split(rows, max(1, PIXELS_OF_A_STRIP // camera.width)):
+        pixels = torch.stack(torch.meshgrid(columns, strip, indexing="xy"), -1)  # (rows, w, 2)
+        rays, seen = camera.rays(pixels.view(-1, 2))
+        yield rays.view(*pixels.shape[:2], 3), seen.view(pixels.shape[:2])

@@ -74,22 +74,35 @@ class Lens:
         return factor, 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
     def _perspective_rays(self, plane: Tensor) -> tuple[Tensor, Tensor]:
-        straight, done = plane.clone(), torch.zeros(len(plane), dtype=torch.bool)
+        x, y = plane.unbind(1)
+        done = torch.zeros(len(plane), dtype=torch.bool)
         for _ in range(STEPS):
-            with torch.enable_grad():
-                here = straight.detach().requires_grad_()
-                factor, by_x, by_y = self._perspective(here[:, 0], here[:, 1])
-                error = factor[:, None] * here + torch.stack([by_x, by_y], 1) - plane  # (n, 2)
-                rows = [torch.autograd.grad(error[:, i].sum(), here, retain_graph=i == 0)[0] for i in range(2)]
-            jacobians = torch.stack(rows, 1)  # (n, 2, 2)
-            solvable = (torch.linalg.det(jacobians).abs() > CONVERGED) & (factor > 0)
-            jacobians = torch.where(solvable[:, None, None], jacobians, torch.eye(2, dtype=plane.dtype))
-            steps = torch.linalg.solve(jacobians, error.detach())
-            straight = torch.where((solvable & ~done)[:, None], straight - steps, straight)
-            done |= solvable & (steps.abs() < CONVERGED).all(1)
-        shrinking = self._perspective(*straight.unbind(1))[0]
-        rays = torch.nn.functional.normalize(torch.cat([straight, torch.ones_like(straight[:, :1])], 1), dim=1)
+            factor, by_x, by_y = self._perspective(x, y)
+            right, down = factor * x + by_x - plane[:, 0], factor * y + by_y - plane[:, 1]
+            by_right, mixed, by_down = self._slopes(x, y, factor)
+            determinants = by_right * by_down - mixed * mixed
+            solvable = (determinants.abs() > CONVERGED) & (factor > 0)
+            across = (by_down * right - mixed * down) / determinants
+            along = (by_right * down - mixed * right) / determinants
+            moved = solvable & ~done
+            x, y = torch.where(moved, x - across, x), torch.where(moved, y - along, y)
+            done |= solvable & (across.abs() < CONVERGED) & (along.abs() < CONVERGED)
+            if bool(done.all()):
+                break
+        shrinking = self._perspective(x, y)[0]
+        rays = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], 1), dim=1)
         return rays, done & (shrinking > LEAST_SHRINKING)
+
+    def _slopes(self, x: Tensor, y: Tensor, factor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the derivatives of a bent point: its x by x, its x by y, which is its y by x, and its y by y."""
+        k1, k2, k3, k4, k5, k6 = self.radial
+        p1, p2 = self.tangential
+        r2 = x * x + y * y
+        numerator, denominator = k1 + r2 * (2 * k2 + r2 * 3 * k3), k4 + r2 * (2 * k5 + r2 * 3 * k6)
+        # Twice the derivative of the factor by r2.
+        twice = 2 * (numerator - factor * denominator) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        mixed = twice * x * y + 2 * p1 * x + 2 * p2 * y
+        return factor + twice * x * x + 2 * p1 * y + 6 * p2 * x, mixed, factor + twice * y * y + 6 * p1 * y + 2 * p2 * x
 
     def _of_angle(self, angles: Tensor) -> Tensor:
         """Return the distances from the axis on the plane of a fisheye lens."""
@@ -107,6 +120,8 @@ class Lens:
             steps = (self._of_angle(angles) - distances) / slopes
             angles = torch.where(done, angles, angles - steps)
             done |= steps.abs() < CONVERGED
+            if bool(done.all()):
+                break
         seen = done & (angles >= 0) & (angles < self._largest_angle(furthest))
         scaled = plane * (torch.sin(angles) / distances.clamp_min(CONVERGED))[:, None]
         return torch.cat([scaled, torch.cos(angles)[:, None]], 1), seen

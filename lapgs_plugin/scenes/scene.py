@@ -262,8 +262,7 @@ def load_scene(
                 own: Tensor | None = read_mask(mask_files[frame.name], image_size(frame.path), size)
             else:
                 own = alpha_mask(frame.path, size) if masks == ALPHA else None
-            if (lit := lit_pixels(camera)) is not None:
-                own = lit if own is None else own & lit
+            own = _within_lens(own, camera, frame.path)
             return own if (above := in_sky()) is None else outside_sky(own, above, sky_files[frame.name])
 
         if not read:
@@ -302,8 +301,26 @@ def lit_pixels(camera: Camera) -> Tensor | None:
     """Return the pixels (1, h, w) to which a camera's lens shows something; None if it does to all."""
     if camera.lens is None:
         return None
-    lit = camera.pixel_rays()[1]
+    lit = camera.lit_pixels()
     return None if bool(lit.all()) else lit[None]
+
+
+def _within_lens(mask: Tensor | None, camera: Camera, path: Path) -> Tensor | None:
+    """Return what a mask (1, h, w) leaves of the pixels that a camera's lens shows; None is all of the photo.
+
+    Raises:
+        SceneError: nothing.
+    """
+    if (lit := lit_pixels(camera)) is None:
+        return mask
+    rest = lit if mask is None else mask & lit
+    if not bool(rest.any()):
+        whose = "its lens shows nothing to any pixel" if mask is None else "its mask hides all that its lens shows"
+        raise SceneError(
+            f"{path}: {whose}, expected a part of the photo to train on; correct the camera's distortion or the mask, "
+            "or leave the photo out"
+        )
+    return rest
 
 
 def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = True) -> list[View]:

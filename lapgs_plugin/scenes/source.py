@@ -72,8 +72,8 @@ def undistort_hint(scene: Path, model: str) -> str:
     if model == ALL_AROUND:
         return f"it sees all around; cut its photos into pinhole images with `lapgs prepare {quote(str(scene))} OUT`"
     return (
-        f"only pinhole images can be trained on; undistort them with `lapgs prepare {quote(str(scene))} OUT`, or see "
-        "--distorted of `lapgs train`"
+        f"undistort its photos with `lapgs prepare {quote(str(scene))} OUT`, or train on them as they are, which is "
+        "slower, with --distorted of `lapgs train`"
     )
 
 

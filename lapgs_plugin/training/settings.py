@@ -334,9 +334,8 @@ class TrainSettings(HierarchySettings):
         density, paper = self.densification, self.protocol == "paper"
         if isinstance(density.options, Auto):
             heuristics = ["--protocol paper"] if paper else self._idle(STRATEGIES[MCMC])
-            length = (
-                max(self.scheduled, LONG_RUN) if self.distorted else self.scheduled
-            )  # along rays there is MCMC alone
+            # Along rays there is MCMC alone, which long runs choose.
+            length = max(self.scheduled, LONG_RUN) if self.distorted else self.scheduled
             name = density.options.choose(length, heuristics)
             chosen = replace(density, strategy=name, options=density.options.options_for(name))
             object.__setattr__(self, "densification", chosen)  # the dataclass is frozen

@@ -50,12 +50,6 @@ from lapgs_plugin.training.stage_start import (
 from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
 from lapgs_plugin.training.warm_up import warm_up
 
-SHARDED = (
-    "--shard: each rank has a share of the Gaussians and renders one view at a time; not with strategies "
-    "but mcmc and 3dgs, --prune, --keep best, --refine-poses, --depth, --sky, --sparse-adam, hooks, --time, --view"
-)
-"""What ranks with some of the Gaussians do, and what they do not."""
-
 
 @dataclass
 class Trainer:
@@ -182,7 +176,7 @@ class Trainer:
             views = [str(self.prepared.schedule_of(stage).views) for stage in self.prepared.plan]
             say(f"{ranks.together}: {' and '.join(views)} views a step are shared out, coarsest level first")
         if self.prepared.sharding.divides:
-            say(SHARDED)
+            say("--shard: each rank has a share of the Gaussians and renders one view at a time")
         if settings.refine_poses and self.prepared.device.type == "cuda":
             say("--refine-poses: views are rendered one by one, which takes longer than several at once")
 
@@ -292,7 +286,7 @@ class Trainer:
         result = self.prepared.rasterizer(run.model.field, view.camera, background=run.background, sh_degree=0)
         if not bool(result.radii.any()):
             self.monitor.say(
-                f"level {run.stage.level}: none of {counted(len(run.model), 'Gaussian')} is visible in {view.name}, "
+                f"level {run.stage.level}: none of {counted(run.num_optimized, 'Gaussian')} is visible in {view.name}, "
                 f"the first view: all are outside of it, behind it, or less than {near:.3g} in front of it; check that "
                 "the points and the cameras are of one model"
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ import torch
 
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.training.preparation import TrainRequest, prepare
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
-from lapgs_plugin.training.ranks.sharded_rasterizer import may_see
+from lapgs_plugin.training.ranks.sharded_rasterizer import ShardedRasterizer, may_see
 from lapgs_plugin.training.ranks.steps import ShardedSteps
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests import ranks, shards
@@ -101,6 +103,22 @@ def test_a_camera_may_see_all_gaussians_that_it_renders(number: int) -> None:
     assert not bool(seen[behind].any())
 
 
+class WithoutCentres(CpuRasterizer):
+    """A rasterizer that gives no gradients by centres."""
+
+    def __call__(self, *values: Any, **more: Any) -> RenderResult:
+        result = super().__call__(*values, **more)
+        return replace(result, means2d=result.means2d.detach(), absgrad2d=None)
+
+
+def test_a_rasterizer_without_gradients_by_centres_is_refused() -> None:
+    field, background = shards.rendered_field(signed=False), torch.zeros(3)
+    for value in field.parameters.values():
+        value.requires_grad_()
+    result = ShardedRasterizer(WithoutCentres(), ALONE)(field, shards.rendered_camera(0), background=background)
+    refuses(UserInputError, "leaves RenderResult.means2d.grad empty", result.image.sum().backward)
+
+
 @pytest.mark.parametrize(
     ("name", "less"),
     # Worst seen: 0.00, 0.12, 0.86, 0.19 and 0.5 dB behind. Steps have other views, and one process differs by 1.2 dB
@@ -165,6 +183,7 @@ def test_every_step_has_equally_many_views_of_each_rank_and_an_epoch_all_views(s
     [
         (["--shard"], "--shard: divides the Gaussians over several ranks; add --gpus 2 or more"),
         (["--shard", "--processes", 1], "--shard: divides the Gaussians over several ranks"),
+        (["--shard", "--tiles", "1x2", "--hierarchy", "nested"], "--shard with --tiles: not for tiles"),
         (["--shard", "--processes", 2, "--view"], "--view with --shard: no rank has all of the Gaussians to show"),
     ],
 )

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import SceneError, TrainingStoppedError, UserInputError
-from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.fields.camera import PIXELS_OF_A_STRIP, Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.lens import Lens
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
@@ -27,6 +27,7 @@ from lapgs_plugin.rendering.run import path_cameras, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes import load_scene
 from lapgs_plugin.scenes.exports.registry import find_export
+from lapgs_plugin.scenes.images import write_image
 from lapgs_plugin.scenes.lenses import lens_of
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.scene import load_cameras
@@ -89,6 +90,19 @@ def test_rays_of_pixels_are_those_of_colmap(model: str) -> None:
     again = np.asarray(theirs.img_from_cam(rays[seen].numpy()))
     np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-4)  # worst 2e-11
     np.testing.assert_allclose(np.linalg.norm(rays[seen].numpy(), axis=1), 1.0)
+
+
+@pytest.mark.parametrize("model", ["FULL_OPENCV", "OPENCV_FISHEYE"])
+def test_rays_of_large_images_are_those_of_colmap(model: str) -> None:
+    """Images whose rays are sought in several strips of rows."""
+    theirs, ours = of_colmap(model, (301, 263), 180.0)
+    rays, seen = ours.pixel_rays()
+    assert ours.width * ours.height > 2 * PIXELS_OF_A_STRIP
+    assert torch.equal(ours.lit_pixels(), seen)
+    assert seen.double().mean() > 0.95
+    rows, columns = np.nonzero(seen.numpy())
+    again = np.asarray(theirs.img_from_cam(rays[seen].numpy()))
+    np.testing.assert_allclose(again, np.stack([columns, rows], 1) + 0.5, rtol=0, atol=1e-4)  # worst 1e-10
 
 
 def test_level_cameras_keep_the_lens() -> None:
@@ -280,6 +294,23 @@ def test_pixels_without_a_ray_are_masked(tmp_path: Path) -> None:
     assert 0.5 < mask.double().mean() < 1.0
     disk = load_scene(tmp_path, distorted=True, progress=False, hold=False, read=False)
     assert torch.equal(disk.train[0].mask, mask)  # type: ignore[arg-type]  # there is one
+
+
+def test_photos_of_which_a_lens_shows_nothing_are_refused(tmp_path: Path) -> None:
+    write_bent_scene(tmp_path, size=SIZE, focal=24.0, views=4)
+    model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    model.cameras[1].model = pycolmap.CameraModelId.OPENCV
+    model.cameras[1].params = [24.0, 24.0, 400.0, 18.0, -5.0, 0.0, 0.0, 0.0]
+    model.write(tmp_path / "sparse" / "0")
+    refuses(SceneError, "00.png: its lens shows nothing to any pixel", load_scene, tmp_path, distorted=True)
+
+
+def test_a_mask_that_hides_all_that_a_lens_shows_is_refused(tmp_path: Path) -> None:
+    write_bent_scene(tmp_path, size=SIZE, focal=15.0, views=4)
+    lit = load_scene(tmp_path, distorted=True, progress=False).train[0].camera.lit_pixels()
+    for number in range(4):
+        write_image(tmp_path / "masks" / f"{number:02d}.png", (~lit).float().expand(3, -1, -1))
+    refuses(SceneError, "its mask hides all that its lens shows", load_scene, tmp_path, distorted=True)
 
 
 def as_transforms(scene: Path, out: Path, lens: dict[str, object]) -> Path:

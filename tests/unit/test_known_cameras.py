@@ -481,7 +481,7 @@ def test_the_command_that_a_refused_scene_is_given_makes_one(tmp_path: Path) -> 
     scene, out = _scene(tmp_path / "scene"), tmp_path / "out"
     with pytest.raises(SceneError) as caught:
         load_scene(scene, progress=False)
-    assert f"undistort them with `lapgs prepare {scene} OUT`" in str(caught.value)
+    assert f"undistort its photos with `lapgs prepare {scene} OUT`" in str(caught.value)
     app = typer.Typer()
     app.command()(prepare)
     result = CliRunner().invoke(app, [str(scene), str(out)])

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, Semantics, degree_to_evaluate
@@ -149,7 +150,11 @@ class _Exchange(torch.autograd.Function):
         returned, width = [by_arrived], sum(COLUMNS)
         if delivery.screen:
             centres, *absolute = delivery.screen
-            assert centres.grad is not None, "a render's own node comes before this one"
+            if centres.grad is None:  # otherwise it is there: a render's own node comes before this one
+                raise UserInputError(
+                    "--shard: this rasterizer leaves RenderResult.means2d.grad empty, which ranks exchange; choose "
+                    "another --rasterizer, or leave --shard out"
+                )
             returned += [centres.grad, *absolute]
         back = delivery.send_back(torch.cat(returned, 1))
         parts = torch.split(back[:, width:], 2, 1) if delivery.screen else ()
