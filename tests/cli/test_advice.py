@@ -36,6 +36,7 @@ OF_OTHER_PROGRAMS = {
     "--blur_up", "--ray_jitter", "--train_test_exp", "--use_train_speedup", "--white_background",  # of scripts
     "--batch_size", "--camera_model", "--data_type", "--depths",
     "--create-dirs", "--force-reinstall", "--standalone",  # of curl, pip and torchrun
+    "--init", "--recursive",  # of git
 }  # fmt: skip
 CLIP = "render {run} --trajectory orbit --frames 2"
 ADVICE = [

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import zstandard
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -128,6 +128,7 @@ def fields(seed: int, degree: int, count: int, size: float) -> GaussianField:
     size=st.floats(1e-3, 1e5),
     version=st.sampled_from((3, 4)),
 )
+@example(seed=26913, degree=1, count=3, size=1.0, version=3)  # a coefficient of 1.003
 def test_every_number_comes_back_within_its_rounding(
     tmp_path_factory: pytest.TempPathFactory, seed: int, degree: int, count: int, size: float, version: int
 ) -> None:
@@ -147,12 +148,14 @@ def test_every_number_comes_back_within_its_rounding(
     ours, theirs = (Rotation.from_quat(f.quaternions.double().numpy()[:, [1, 2, 3, 0]]) for f in (field, back))
     assert (ours.inv() * theirs).magnitude().max() < 0.006  # radians; 0.0042 seen: three roundings of 1/723
     directions = torch.nn.functional.normalize(field.means, dim=1)
-    held = torch.cat([field.sh[:, :1].clamp(-3.333, 3.333), field.sh[:, 1:].clamp(-1, 127 / 128)], dim=1)
+    held = torch.cat([field.sh[:, :1].clamp(-3.333, 3.333), field.sh[:, 1:].clamp(-1, 1)], dim=1)
     seen = sh_to_color(held, directions, degree, signed=True)
     turned = directions * torch.tensor([1.0, -1.0, -1.0])
     written = sh_to_color(read.sh, turned, degree, signed=True)
     basis = sh_basis(directions, degree).abs()  # (n, k)
-    most = 0.0132 * basis[:, 0] + basis[:, 1:].sum(dim=1) / 255.9  # half a step of each coefficient
+    # Half a step of each coefficient; the largest that the file holds, along axes of its own, is 127/128 or -1.
+    steps = 1 / 255.9 + (held[:, 1:].abs() > 127 / 128).any(dim=2) / 128
+    most = 0.0132 * basis[:, 0] + (basis[:, 1:] * steps).sum(dim=1)
     assert ((seen - written).abs() <= most[:, None] + 1e-5).all()
 
 
