@@ -14,7 +14,7 @@ import copy
 from collections import Counter
 from typing import NamedTuple
 
-from lapgs_plugin.checkouts.rewriting import STATEMENTS, Change, call
+from lapgs_plugin.checkouts.rewriting import StatementsChange, call
 
 LOSSES = "_lapgs_losses"
 """Name of the function that returns L1 and the loss, or None if the statements have to be executed."""
@@ -48,7 +48,7 @@ class _Loss(NamedTuple):
         return {term.id for term in (self.l1, self.ssim) if isinstance(term, ast.Name)}
 
 
-class LossStatements(Change):
+class LossStatements(StatementsChange):
     """Replace the statements of a photometric loss, where one function can compute its terms together.
 
     if VALUES := LOSSES(l1_loss, ssim, False, image, gt_image, opt.lambda_dssim):
@@ -70,15 +70,6 @@ class LossStatements(Change):
             case ast.Call(ast.Attribute(ast.Name() as loss, "backward"), [], []):
                 node.value = ast.copy_location(call(BACKWARD, loss), node.value)
                 self.changes += 1
-        return node
-
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        """Return the node with losses in the places of its statements."""
-        super().generic_visit(node)
-        for name in STATEMENTS:
-            statements = getattr(node, name, None)
-            if isinstance(statements, list):
-                setattr(node, name, self._replaced(statements))
         return node
 
     def _replaced(self, statements: list[ast.stmt]) -> list[ast.stmt]:

@@ -17,7 +17,7 @@ from collections.abc import Collection, Mapping
 from itertools import groupby
 from typing import NamedTuple
 
-from lapgs_plugin.checkouts.rewriting import STATEMENTS, Change, call
+from lapgs_plugin.checkouts.rewriting import Change, StatementsChange, call
 
 UPDATE = "_lapgs_update"
 """Name of the function that updates the rows, and returns whether it did."""
@@ -41,7 +41,7 @@ class _Update(NamedTuple):
     arguments: tuple[ast.expr, ...]
 
 
-class MaskedUpdates(Change):
+class MaskedUpdates(StatementsChange):
     """Replace runs of statements that update rows of a mask, where the same can be done without listing the rows.
 
     if not UPDATE(shown, (self.sums, False, points.grad, (None, 2), None), (self.denom, False, 1, None, None)):
@@ -49,18 +49,12 @@ class MaskedUpdates(Change):
         self.denom[shown] += 1
     """
 
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        """Return the node with updates in the places of its statements."""
-        super().generic_visit(node)
-        for name in STATEMENTS:
-            statements = getattr(node, name, None)
-            if isinstance(statements, list):
-                runs = groupby(statements, lambda statement: update.mask if (update := _update(statement)) else None)
-                replaced = [self._replaced(mask, list(run)) for mask, run in runs]
-                setattr(node, name, [statement for run in replaced for statement in run])
-        return node
+    def _replaced(self, statements: list[ast.stmt]) -> list[ast.stmt]:
+        runs = groupby(statements, lambda statement: update.mask if (update := _update(statement)) else None)
+        replaced = [self._updated(mask, list(run)) for mask, run in runs]
+        return [statement for run in replaced for statement in run]
 
-    def _replaced(self, mask: str | None, statements: list[ast.stmt]) -> list[ast.stmt]:
+    def _updated(self, mask: str | None, statements: list[ast.stmt]) -> list[ast.stmt]:
         if mask is None:
             return statements
         self.changes += len(statements)

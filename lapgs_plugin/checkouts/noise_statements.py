@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lapgs_plugin.checkouts.rewriting import STATEMENTS, Change, call
+from lapgs_plugin.checkouts.rewriting import StatementsChange, call
 
 SHAKE = "_lapgs_shake"
 """Name of the function that shakes positions, and returns whether it did.
@@ -35,7 +35,7 @@ class _Noise(NamedTuple):
     variables: set[str]
 
 
-class NoiseStatements(Change):
+class NoiseStatements(StatementsChange):
     """Replace the statements of noise, where one function can do the same.
 
     def fading(x): ...
@@ -48,15 +48,6 @@ class NoiseStatements(Change):
 
     def __init__(self, function: ast.FunctionDef) -> None:
         self._uses = _uses([function])
-
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        """Return the node with noise in the places of its statements."""
-        super().generic_visit(node)
-        for name in STATEMENTS:
-            statements = getattr(node, name, None)
-            if isinstance(statements, list):
-                setattr(node, name, self._replaced(statements))
-        return node
 
     def _replaced(self, statements: list[ast.stmt]) -> list[ast.stmt]:
         for start in range(len(statements)):

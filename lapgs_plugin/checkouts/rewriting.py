@@ -44,6 +44,23 @@ class Change(ast.NodeTransformer):
     changes = 0
 
 
+class StatementsChange(Change):
+    """Change lists of statements, from the innermost outwards."""
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        """Return the node with other statements in the places of some."""
+        super().generic_visit(node)
+        for name in STATEMENTS:
+            statements = getattr(node, name, None)
+            if isinstance(statements, list):
+                setattr(node, name, self._replaced(statements))
+        return node
+
+    def _replaced(self, statements: list[ast.stmt]) -> list[ast.stmt]:
+        """Return the statements, some of which may be others; `changes` counts these."""
+        raise NotImplementedError
+
+
 def call(name: str, *arguments: ast.expr) -> ast.Call:
     """Return a call of a function by its name, without a place in the source."""
     return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
