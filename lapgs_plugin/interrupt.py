@@ -204,13 +204,22 @@ def _leave_if_lost(unraisable: Any) -> None:
 
 
 def _keeping_handlers(load: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
-    """Restore our handlers after a compiled module is loaded: pycolmap's of SIGTERM prints a C++ stack."""
+    """Restore our handlers after a compiled module is loaded: pycolmap's of SIGTERM prints a C++ stack.
+
+    A signal that comes while it is loaded waits until then.
+    """
 
     def load_and_restore(self: Any, module: Any) -> None:
-        load(self, module)
-        if threading.current_thread() is threading.main_thread():
+        if threading.current_thread() is not threading.main_thread():
+            load(self, module)
+            return
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            load(self, module)
+        finally:
             for number in SIGNALS:
                 if (handler := signal.getsignal(number)) is not None:
                     signal.signal(number, handler)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
     return load_and_restore

@@ -228,6 +228,31 @@ def test_a_signal_while_a_compiled_module_is_loaded(which: signal.Signals) -> No
     assert done.stderr == f"lapgs: stopped by {name}\n"
 
 
+BEFORE_THE_HANDLER_IS_OURS_AGAIN = """
+import os, signal
+from importlib.machinery import ExtensionFileLoader
+from lapgs_plugin import interrupt
+
+def load(self, module):  # handles the signal itself, as pycolmap does
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(7))
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.signal(signal.SIGTERM, ours)
+
+ExtensionFileLoader.exec_module = load
+interrupt.install()
+ours = signal.getsignal(signal.SIGTERM)
+with interrupt.command():
+    ExtensionFileLoader.exec_module(None, None)
+"""
+
+
+def test_a_signal_waits_while_a_compiled_module_has_a_handler_of_its_own() -> None:
+    code = BEFORE_THE_HANDLER_IS_OURS_AGAIN
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 143, done.stderr
+    assert done.stderr == "lapgs: stopped by SIGTERM\n"
+
+
 AFTER_PYCOLMAP = """
 import os, signal
 from lapgs_plugin import interrupt
