@@ -59,17 +59,26 @@ def _scales_gradient_kernel(
     _store(by_log_scales, rows, here, by_a, by_b, by_c * c / tl.sqrt(c + filtered))
 
 
+@triton.jit
+def _dimmed(
+    logits: tl.tensor, log_scales: tl.tensor, filters: tl.tensor, rows: tl.tensor, here: tl.tensor
+) -> tuple[tl.tensor, ...]:
+    """Return squared scales and filters, the square of the share that is left of opacities, and these."""
+    a, b, c = _squares(log_scales, rows, here)
+    filtered = tl.load(filters + rows, here, 1.0)
+    filtered *= filtered
+    shrunk = a * b * c / ((a + filtered) * (b + filtered) * (c + filtered))
+    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + rows, here, 0.0)))
+    return a, b, c, filtered, shrunk, opacity
+
+
 @triton.jit(do_not_specialize=("n",))  # no types
 def _opacities_kernel(
     logits: tl.tensor, log_scales: tl.tensor, filters: tl.tensor, opacities: tl.tensor, n: int, block: tl.constexpr
 ) -> None:
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here = rows < n
-    a, b, c = _squares(log_scales, rows, here)
-    filtered = tl.load(filters + rows, here, 1.0)
-    filtered *= filtered
-    shrunk = a * b * c / ((a + filtered) * (b + filtered) * (c + filtered))
-    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + rows, here, 0.0)))
+    _, _, _, _, shrunk, opacity = _dimmed(logits, log_scales, filters, rows, here)
     tl.store(opacities + rows, opacity * tl.sqrt(shrunk), here)
 
 
@@ -80,11 +89,7 @@ def _opacities_gradient_kernel(
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here = rows < n
-    a, b, c = _squares(log_scales, rows, here)
-    filtered = tl.load(filters + rows, here, 1.0)
-    filtered *= filtered
-    shrunk = a * b * c / ((a + filtered) * (b + filtered) * (c + filtered))
-    opacity = 1.0 / (1.0 + tl.exp(-tl.load(logits + rows, here, 0.0)))
+    a, b, c, filtered, shrunk, opacity = _dimmed(logits, log_scales, filters, rows, here)
     gradient = tl.load(by_opacities + rows, here, 0.0) * opacity * tl.sqrt(shrunk)
     tl.store(by_logits + rows, gradient * (1.0 - opacity), here)
     # The logarithm of s / sqrt(s^2 + f^2) by that of s is f^2 / (s^2 + f^2).
