@@ -173,6 +173,8 @@ def read_image(
     source = _open(path, pixels=True)
     full_width, full_height = _image_plane(path, source)
     width, height = size or (full_width, full_height)
+    if _has_levels(source, (width, height)):
+        return _in_unit_range(_read_levels(path, source))
     # The filter is separable: first along the rows of each strip, then along columns.
     narrowed = torch.empty(3, full_height, width)
     for top, strip in _strips(path, source, (full_width, full_height), background):
@@ -229,9 +231,7 @@ class PhotoFile:
                 f"{self.path}: the file changed while it was used, expected {width}x{height} opaque pixels of 8 bits; "
                 "put the photo back"
             )
-        colour = _channels(source.spec()).colour
-        pixels = _read_rows(self.path, source, 0, source.spec().height, max(colour) + 1, oiio.UINT8)
-        return torch.from_numpy(pixels if pixels.shape[2] == 3 else pixels.repeat(3, axis=2)).permute(2, 0, 1)
+        return torch.from_numpy(_read_levels(self.path, source)).permute(2, 0, 1)
 
 
 def _has_levels(source: oiio.ImageInput, size: tuple[int, int]) -> bool:
@@ -240,6 +240,21 @@ def _has_levels(source: oiio.ImageInput, size: tuple[int, int]) -> bool:
     channels = _channels(spec)
     flat = spec.depth <= 1 and not spec.deep and bool(channels.colour)
     return flat and channels.alpha < 0 and spec.format.basetype == oiio.UINT8 and (spec.width, spec.height) == size
+
+
+def _read_levels(path: Path, source: oiio.ImageInput) -> NDArray[np.uint8]:
+    """Read a file that `_has_levels` as RGB, (h, w, 3)."""
+    spec = source.spec()
+    levels: NDArray[np.uint8] = _read_rows(path, source, 0, spec.height, max(_channels(spec).colour) + 1, oiio.UINT8)
+    return levels if levels.shape[2] == 3 else levels.repeat(3, axis=2)
+
+
+def _in_unit_range(levels: NDArray[np.uint8]) -> Tensor:
+    """Return levels k of RGB (h, w, 3) as k / 255, (3, h, w) float32, rounded as OpenImageIO does."""
+    image = np.empty((3, *levels.shape[:2]), np.float32)
+    for channel in range(3):  # faster than decoding to floats, then moving channels
+        np.multiply(levels[..., channel], np.float32(1 / 255), out=image[channel], dtype=np.float32)
+    return torch.from_numpy(image)
 
 
 def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
