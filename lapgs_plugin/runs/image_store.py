@@ -45,14 +45,14 @@ GPU_SHARE = 0.1
 
 EIGHT_BIT_TOLERANCE = 1e-6
 """Largest distance from k/255 of a value of an 8-bit image: a GPU multiplies by 1/255, which may be an ulp off."""
-AHEAD = 16
+AHEAD = 24
 """Most prefetched images that wait on the device; one more replaces the oldest, which may never be used."""
 AHEAD_BYTES = 2 << 30
 """Most bytes of them, of which one may have more."""
 LOADERS = 4
 """Fewest threads that read files. Some read while the image of another is being copied."""
-MOST_LOADERS = AHEAD
-"""Most threads that read files or decode photos, one for each processor."""
+MOST_LOADERS = 16
+"""Most threads that read files or decode photos, one for each processor; fewer than `AHEAD`, so that some are ready."""
 
 
 def choose_place(total_bytes: int, device: torch.device | str) -> str:

@@ -120,9 +120,10 @@ def test_files_are_read_several_views_ahead(tmp_path: Path, monkeypatch: pytest.
     few = replace(loaded, points=loaded.points[:200], colors=loaded.colors[:200])
     monkeypatch.setattr(ImageStore, "prefetch", noted_prefetch)
     monkeypatch.setattr(ImageStore, "get_stored", noted_get)
-    train(tmp_path / "run", few, replace(SETTINGS, iterations=24, levels=1, images_on="disk", views_per_step="1"))
+    settings = replace(SETTINGS, iterations=AHEAD + 16, levels=1, images_on="disk", views_per_step="1")
+    train(tmp_path / "run", few, settings)
     order = [name for name, _ in uses]
-    assert len(order) == 24
+    assert len(order) == AHEAD + 16
     for number, (_, asked_for) in enumerate(uses[1:-AHEAD], start=2):  # nothing comes before the first view
         assert {*order[number : number + AHEAD - 2]} - {order[number - 1]} <= asked_for
 
