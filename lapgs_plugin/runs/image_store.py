@@ -5,7 +5,8 @@ copied, a quarter of float32 for 8-bit photographs:
 
     "gpu"     bytes on the device
     "memory"  bytes in memory; for a GPU page-locked, so that the GPU copies them while it and the processor work
-    "disk"    one file for each image; a thread of the store reads it into page-locked memory, and then as above
+    "disk"    one file for each image; a thread of the store reads it into page-locked memory, and then as above.
+              `put_reader` takes a function in place of the image, such as one that decodes a photo's own file
 
 `prefetch` starts the copy early, and `get` waits for it by an event in the GPU's own queue of work.
 """
@@ -32,6 +33,7 @@ from torch import Tensor
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
 from lapgs_plugin.files import one_line_errors
 from lapgs_plugin.hierarchy.settings import AUTO, PLACES, PRECISIONS
+from lapgs_plugin.limits import usable_processors
 from lapgs_plugin.ops.mixed_sizes import stack_padded
 
 DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISIONS}
@@ -43,12 +45,14 @@ GPU_SHARE = 0.1
 
 EIGHT_BIT_TOLERANCE = 1e-6
 """Largest distance from k/255 of a value of an 8-bit image: a GPU multiplies by 1/255, which may be an ulp off."""
-AHEAD = 8
+AHEAD = 24
 """Most prefetched images that wait on the device; one more replaces the oldest, which may never be used."""
 AHEAD_BYTES = 2 << 30
 """Most bytes of them, of which one may have more."""
 LOADERS = 4
-"""Threads that read files. Some read while the image of another is being copied."""
+"""Fewest threads that read files. Some read while the image of another is being copied."""
+MOST_LOADERS = 16
+"""Most threads that read files or decode photos, one for each processor; fewer than `AHEAD`, so that some are ready."""
 
 
 def choose_place(total_bytes: int, device: torch.device | str) -> str:
@@ -84,6 +88,7 @@ class _Image:
         low: value of a stored 0.
         stored: the bytes on the device or in memory; None on disk.
         path: the file; None elsewhere.
+        read: returns the stored bytes, for an image that is neither in memory nor in a file of the store.
         page_locked: keeps `stored` page-locked.
     """
 
@@ -92,6 +97,7 @@ class _Image:
     low: float
     stored: Tensor | None = None
     path: Path | None = None
+    read: Callable[[], Tensor] | None = None
     page_locked: PageLocked | None = None
 
 
@@ -138,7 +144,12 @@ class ImageStore:
             if self._device.type == "cuda"
             else None
         )
-        self._loaders = ThreadPoolExecutor(max_workers=LOADERS, thread_name_prefix="image-store")
+        self._loaders = ThreadPoolExecutor(
+            max_workers=max(LOADERS, min(MOST_LOADERS, usable_processors())),
+            thread_name_prefix="image-store",
+            initializer=torch.set_num_threads,  # torch's own threads would compete with these
+            initargs=(1,),
+        )
         self._staging = threading.local()
         self._255 = torch.tensor(255.0, device=self._device)
 
@@ -158,6 +169,21 @@ class ImageStore:
         if (coming := self._coming.pop(name, None)) is not None:
             wait([coming])
         self._images[name] = self._keep(name, encoded, low, divisor)
+
+    def put_reader(self, name: str, shape: tuple[int, int, int], read: Callable[[], Tensor]) -> None:
+        """Store an image as a function that threads call at each use. It takes no memory between uses, and no disk.
+
+        Args:
+            name: of the view; an earlier image is replaced.
+            shape: (c, h, w).
+            read: returns the image in the store's precision, on the CPU: as it is, or for "uint8" the levels k of
+                k / 255. The fastest layout for a GPU has channels last. `get` raises its errors.
+        """
+        assert self._where == "disk", "elsewhere images are kept"
+        if (coming := self._coming.pop(name, None)) is not None:
+            wait([coming])
+        divisor = self._255 if self._dtype == torch.uint8 else None
+        self._images[name] = _Image(torch.Size(shape), divisor, 0.0, read=read)
 
     def prefetch(self, name: str) -> None:
         """Start copying an image to the device in the background, where it waits for `get`.
@@ -187,6 +213,7 @@ class ImageStore:
         Raises:
             KeyError: there is no such image.
             RunFolderError: its file cannot be read any more.
+            Exception: that of the function of `put_reader`.
         """
         first, *others = (self._images[name] for name in names)
         if any(image.low != first.low or image.divisor is not first.divisor for image in others):
@@ -319,22 +346,29 @@ class ImageStore:
         return path
 
     def _bring(self, stored: Tensor) -> _Arrival:
-        """Copy page-locked bytes to the GPU while it works."""
+        """Copy page-locked bytes to the GPU while it works, which makes them contiguous."""
         with torch.cuda.stream(self._stream):
-            arriving = stored.to(self._device, non_blocking=True)
+            arriving = stored.to(self._device, non_blocking=True).contiguous()
             event = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]
             event.record()
         return _Arrival(arriving, event)
 
     def _read(self, image: _Image) -> _Arrival:
-        """Read a file and copy it to the device; runs in a loader thread."""
-        assert image.path is not None
-        if self._stream is None:
-            stored = torch.empty(image.shape, dtype=self._dtype)
-            _read_file(image.path, stored)
-            return _Arrival(stored, None)
-        staged = self._staged(image)
-        _read_file(image.path, staged)
+        """Read an image and copy it to the device; runs in a loader thread."""
+        if image.read is not None:
+            values = image.read()
+            assert (values.shape, values.dtype) == (image.shape, self._dtype)
+            if self._stream is None:
+                return _Arrival(values.contiguous(), None)
+            channels, height, width = image.shape
+            # Decoders put channels last. Moving them takes a processor as long as decoding; the GPU does it.
+            staged = self._staged(image).view(height, width, channels).permute(2, 0, 1).copy_(values)
+        else:
+            assert image.path is not None
+            staged = torch.empty(image.shape, dtype=self._dtype) if self._stream is None else self._staged(image)
+            _read_file(image.path, staged)
+            if self._stream is None:
+                return _Arrival(staged, None)
         arrival = self._bring(staged)
         assert arrival.event is not None
         arrival.event.synchronize()  # the thread reads its next image into the same memory

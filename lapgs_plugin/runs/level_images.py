@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from lapgs_plugin.hierarchy.plan import level_size
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.ops.mixed_sizes import stack_padded
+from lapgs_plugin.ops.photometric_loss import decoded
 from lapgs_plugin.runs.image_store import DTYPES, ImageStore, choose_place
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 
@@ -129,12 +130,13 @@ class LevelImages:
         """Make and store the images of a view.
 
         Args:
-            image: (3, h, w) at full size.
+            image: (3, h, w) at full size, floats, or uint8 levels k of k / 255.
             mask: (1, h, w), False where the image is ignored; None uses all of it.
             with_coarse: False for a view whose Up(I^(l+1)) is not needed.
         """
         coarse = self.coarse if with_coarse else None
-        image, levels = image.to(self._device), self._level + 1 + (coarse is not None)
+        # Levels are contiguous and floats on a GPU, where that takes no time.
+        image, levels = decoded(image.to(self._device).contiguous()), self._level + 1 + (coarse is not None)
         if mask is None:
             images = self._pyramid.gaussian(image, levels)
             weight = torch.ones_like(images[self._level][:1])
@@ -147,6 +149,17 @@ class LevelImages:
         self.targets.put(name, target)
         if coarse is not None:
             coarse.put(name, images[self._level + 1], (target.shape[1], target.shape[2]))
+
+    @property
+    def takes_readers(self) -> bool:
+        """Whether an image is on the disk as it is at full size, so that `put_reader` can leave it in its own file."""
+        return self._level == 0 and self.targets.where == "disk" and self.coarse is None and self.weights is None
+
+    def put_reader(self, name: str, size: tuple[int, int], read: Callable[[], Tensor]) -> None:
+        """Store I^0 of a view of this (width, height) as `ImageStore.put_reader` does."""
+        assert self.takes_readers
+        assert isinstance(self.targets, ImageStore)
+        self.targets.put_reader(name, (3, size[1], size[0]), read)
 
     def prefetch(self, *names: str) -> None:
         """Start copying the images of views to the device."""

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePath
 from shlex import quote
 from typing import Generic, TypeVar, cast
@@ -25,7 +26,7 @@ from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
 from lapgs_plugin.scenes.exports.registry import find_export, read_export
-from lapgs_plugin.scenes.images import image_size, not_there, read_as_3dgs, read_image, same_shape, where_else
+from lapgs_plugin.scenes.images import PhotoFile, image_size, not_there, read_as_3dgs, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
     ALPHA,
     AUTO,
@@ -113,6 +114,12 @@ class View:
     def on_disk(self) -> bool:
         """Whether the image is read at each access."""
         return callable(vars(self)["_image"])
+
+    @property
+    def photo_file(self) -> PhotoFile | None:
+        """The file that the image is read from at each access; None if it is in memory or not one file's."""
+        held = vars(self)["_image"]
+        return held if isinstance(held, PhotoFile) else None
 
     def at(self, camera: Camera) -> View:
         """Return the view with another camera of the same size."""
@@ -248,10 +255,9 @@ def load_scene(
         frame, camera = posed
         size = camera.size
 
-        def image() -> Tensor:
-            if rule.backbone is not None:
-                return read_as_3dgs(frame.path, size, behind)
-            return read_image(frame.path, size=size, background=background)
+        image: Callable[[], Tensor] = PhotoFile(frame.path, size, background)
+        if rule.backbone is not None:
+            image = partial(read_as_3dgs, frame.path, size, behind)
 
         def in_sky() -> Tensor | None:
             file = sky_files.get(frame.name)
@@ -270,9 +276,10 @@ def load_scene(
             return View(
                 frame.name, camera, image, mask if masked else None, in_sky if frame.name in sky_files else None
             )
-        pixels, inside, above = image(), mask(), in_sky()
         if hold:
-            return View(frame.name, camera, pixels, inside, above)
+            return View(frame.name, camera, image(), mask(), in_sky())
+        _decode(image)
+        inside, above = mask(), in_sky()
         later = None if inside is None else mask, None if above is None else in_sky
         return View(frame.name, camera, image, *later)
 
@@ -295,6 +302,18 @@ def load_scene(
         background=background,
         unit=unit_of_depth(depth) if depth else 1.0,
     )
+
+
+def _decode(image: Callable[[], Tensor]) -> None:
+    """Read an image that is not kept, to find out whether it can be read.
+
+    Raises:
+        SceneError: it cannot.
+    """
+    if isinstance(image, PhotoFile) and image.has_levels:
+        image.levels()  # decodes the same bytes, in less time
+    else:
+        image()
 
 
 def lit_pixels(camera: Camera) -> Tensor | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -22,6 +23,7 @@ from lapgs_plugin.runs.profiling import Overhead
 from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import SparseColors, colors_at, measure_exposure, sparse_colors
+from lapgs_plugin.scenes.parallel import MOST_READERS, ahead, readers_of
 from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.scenes.vignetting import measure_vignetting
 from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, ViewColors, from_gains, identities
@@ -72,15 +74,33 @@ def _moments(run: PreparedRun, level: int, field: GaussianField) -> dict[str, An
 
 
 def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
-    """Return the images of a stage with the photos of its training views, on a CPU as float32."""
+    """Return the images of a stage with the photos of its training views, on a CPU as float32.
+
+    Photos on the disk stay in their own files where a stage needs no more than what they hold.
+    """
     views, on_gpu = run.owned(run.scene.train), run.device.type == "cuda"
-    eight_bit = on_gpu and stage.level == 0
-    eight_bit = eight_bit and all(eight_bit_levels(view.image) is not None for view in with_pixels(views))
+    files = {view.name: file for view in views if (file := view.photo_file) is not None}
+    on_disk = len(files) == len(views)
+    has_levels = on_gpu and on_disk and all(ahead(lambda file: file.has_levels, files.values(), most=MOST_READERS))
+    eight_bit = on_gpu and stage.level == 0 and (has_levels or _are_eight_bit(views))
     masked = any(view.masked for view in run.scene.train)  # on every rank or on none
     images = StageImages(run, stage, sizes_of(views), eight_bit=eight_bit, masked=masked, exact=not on_gpu)
-    for view in with_pixels(views):
-        images.photos.put(view.name, view.image, view.mask)
+    if images.photos.takes_readers and on_disk and has_levels == on_gpu:
+        for view in views:
+            file = files[view.name]
+            images.photos.put_reader(view.name, view.camera.size, file.levels if has_levels else file)
+        return images
+
+    def pixels(view: View) -> tuple[str, Tensor, Tensor | None]:
+        return view.name, files[view.name].levels() if has_levels else view.image, view.mask
+
+    for name, image, mask in ahead(pixels, views, most=readers_of(view.camera.size for view in views)):
+        images.photos.put(name, image, mask)
     return images
+
+
+def _are_eight_bit(views: Sequence[View]) -> bool:
+    return all(eight_bit_levels(view.image) is not None for view in with_pixels(views))
 
 
 def predict_views(run: PreparedRun, stage: Stage, images: StageImages, overhead: Overhead) -> None:
@@ -194,7 +214,10 @@ def _sparse_colors(run: PreparedRun) -> SparseColors | None:
     """Look up sparse points in the photos of all ranks."""
 
     def look_up(points: Tensor) -> list[tuple[Tensor, Tensor]]:
-        own = {view.name: colors_at(view, points) for view in run.owned(run.scene.train)}
+        views = run.owned(run.scene.train)
+        readers = readers_of(view.camera.size for view in views)
+        names = [view.name for view in views]
+        own = dict(zip(names, ahead(partial(colors_at, points=points), views, most=readers), strict=True))
         seen = {name: colors for one in run.ranks.gathered(own) for name, colors in one.items()}
         return [seen[view.name] for view in run.scene.train]
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,8 @@ from PIL import Image
 from lapgs_plugin.checkouts.level_views import FullSizeImage, SceneImages
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runs.image_store import AHEAD, ImageStore
-from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.scenes import images, load_scene
+from lapgs_plugin.scenes.images import read_image
 from lapgs_plugin.scenes.scene import View, with_pixels
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.cli.run_folder import write_scene
@@ -69,6 +72,35 @@ def test_training_holds_no_more_images_of_more_photos(tmp_path: Path) -> None:
     assert on_disk[32][0] <= on_disk[8][0] + 2 * photo
 
 
+def test_photos_at_full_size_stay_in_their_own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No copy of them is written, the thread that trains decodes none, and no bit changes."""
+    scene = write_scene(tmp_path / "scene", [f"photos/{i:02d}.png" for i in range(12)], SIZE)
+    written: dict[int, set[str]] = {}
+    readers: list[threading.Thread] = []
+
+    class Written(StageHook):
+        def before_render(self, context: StageContext) -> None:
+            files = (tmp_path / "disk").rglob("*.bin")
+            written.setdefault(context.stage.level, set()).update(file.parent.name for file in files)
+
+    def noted(*args: Any, **options: Any) -> torch.Tensor:
+        readers.append(threading.current_thread())
+        return read_image(*args, **options)
+
+    def fields(where: str) -> list[bytes]:
+        loaded = load_scene(scene, progress=False, hold=where != "disk")
+        loaded = replace(loaded, points=loaded.points[:200], colors=torch.rand(200, 3))  # photos are compared at points
+        settings = replace(SETTINGS, hierarchy="nested", iterations=24, images_on=where)
+        return plys(train(tmp_path / where, loaded, settings, user_hooks=[Written()]))
+
+    in_memory = fields("memory")
+    monkeypatch.setattr(images, "read_image", noted)
+    assert fields("disk") == in_memory
+    assert written == {1: {"targets_1"}, 0: set()}
+    assert len(readers) >= 3 * 12, "to compare them, for level 1, and whenever a view is trained on at full size"
+    assert threading.main_thread() not in readers
+
+
 def test_files_are_read_several_views_ahead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, uses = masked_scene(tmp_path / "scene", 16), []
     waiting: set[str] = set()
@@ -88,9 +120,10 @@ def test_files_are_read_several_views_ahead(tmp_path: Path, monkeypatch: pytest.
     few = replace(loaded, points=loaded.points[:200], colors=loaded.colors[:200])
     monkeypatch.setattr(ImageStore, "prefetch", noted_prefetch)
     monkeypatch.setattr(ImageStore, "get_stored", noted_get)
-    train(tmp_path / "run", few, replace(SETTINGS, iterations=24, levels=1, images_on="disk", views_per_step="1"))
+    settings = replace(SETTINGS, iterations=AHEAD + 16, levels=1, images_on="disk", views_per_step="1")
+    train(tmp_path / "run", few, settings)
     order = [name for name, _ in uses]
-    assert len(order) == 24
+    assert len(order) == AHEAD + 16
     for number, (_, asked_for) in enumerate(uses[1:-AHEAD], start=2):  # nothing comes before the first view
         assert {*order[number : number + AHEAD - 2]} - {order[number - 1]} <= asked_for
 

@@ -9,6 +9,7 @@ import os
 import random
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from torch import Tensor
 
-from lapgs_plugin.errors import RunFolderError, TrainingDivergedError, UserInputError
+from lapgs_plugin.errors import RunFolderError, SceneError, TrainingDivergedError, UserInputError
 from lapgs_plugin.runs import image_store
 from lapgs_plugin.runs.image_store import AHEAD, ImageStore, PageLocked, choose_place
 from tests.waiting import wait_for
@@ -173,6 +174,48 @@ def test_bytes_on_a_gpu_are_counted(tmp_path: Path, device: str, where: str, pre
         if where == "disk":
             assert sum(file.stat().st_size for file in (tmp_path / "images").iterdir()) == 3 * size
     assert not (tmp_path / "images").exists()
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, needs_cuda])])
+@pytest.mark.parametrize("precision", ["uint8", "float32"])
+def test_functions_take_the_place_of_images(tmp_path: Path, device: str, precision: str) -> None:
+    """They are called by threads at each use, and nothing of them is in memory or on the disk in between."""
+    sizes = {f"{i}": (5 + i % 3, 4) for i in range(3 * AHEAD)}
+    levels = {name: eight_bit(*size, 3).permute(2, 0, 1) for name, size in sizes.items()}  # channels last in memory
+    callers: dict[str, list[threading.Thread]] = {name: [] for name in sizes}
+
+    def reader(name: str) -> Callable[[], Tensor]:
+        def read() -> Tensor:
+            callers[name].append(threading.current_thread())
+            return levels[name] if precision == "uint8" else levels[name] / 255
+
+        return read
+
+    def gone() -> Tensor:
+        raise SceneError("gone")
+
+    with store(tmp_path, "disk", precision, device) as kept:
+        for name, (height, width) in sizes.items():
+            kept.put_reader(name, (3, height, width), reader(name))
+        assert not any(callers.values())
+        for _ in range(2):
+            for name in sizes:
+                kept.prefetch(name)
+            for name in sizes:
+                assert torch.equal(kept.get(name).cpu(), levels[name] / 255)
+                stored = kept.get_stored(name)
+                assert stored.dtype == getattr(torch, precision)
+                assert stored.is_contiguous()
+        assert all(len(threads) >= 4 for threads in callers.values())
+        assert threading.main_thread() not in {thread for threads in callers.values() for thread in threads}
+        alike = [name for name, size in sizes.items() if size == sizes["0"]]
+        assert torch.equal(kept.get(*alike).cpu(), torch.stack([levels[name] for name in alike]) / 255)
+        kept.put_reader("0", (3, 2, 2), gone)
+        with pytest.raises(SceneError, match="gone"):
+            kept.get("0")
+        assert not (tmp_path / "images").exists()
+        kept.put("0", torch.ones(3, 2, 2))
+        assert torch.equal(kept.get("0").cpu(), torch.ones(3, 2, 2))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")

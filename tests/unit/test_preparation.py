@@ -12,7 +12,7 @@ import pytest
 
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError, UserInputError
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.scenes import scene as scene_module
+from lapgs_plugin.scenes.images import PhotoFile
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.training import preparation
@@ -40,7 +40,8 @@ def unread(monkeypatch: pytest.MonkeyPatch) -> None:
     def read(*_: Any, **__: Any) -> None:
         raise AssertionError("a photo was read")
 
-    monkeypatch.setattr(scene_module, "read_image", read)
+    for way in ("__call__", "levels"):
+        monkeypatch.setattr(PhotoFile, way, read)
 
 
 def trained(request: TrainRequest, monitor: Monitor | None = None) -> RunArchive:

@@ -24,7 +24,15 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
-from lapgs_plugin.scenes.images import check_image, image_size, read_as_3dgs, read_image, resize_image, write_image
+from lapgs_plugin.scenes.images import (
+    PhotoFile,
+    check_image,
+    image_size,
+    read_as_3dgs,
+    read_image,
+    resize_image,
+    write_image,
+)
 from tests.refusals import refuses
 
 
@@ -57,6 +65,44 @@ def as_tensor(pixels: NDArray[np.generic]) -> Tensor:
 
 
 # Reading
+
+
+@pytest.mark.parametrize(("name", "mode"), [("a.png", "RGB"), ("a.jpg", "RGB"), ("a.png", "L"), ("a.png", "P")])
+def test_photos_of_8_bits_are_read_as_they_are(tmp_path: Path, name: str, mode: str) -> None:
+    pixels = Image.fromarray((255 * smooth(57, 43)).astype(np.uint8)).convert(mode)
+    pixels.save(tmp_path / name)
+    expected = cv2.imread(str(tmp_path / name))[..., ::-1]
+    photo = PhotoFile(tmp_path / name, (57, 43), (0.0, 0.0, 0.0))
+    assert photo.has_levels
+    assert torch.equal(photo.levels(), as_tensor(expected))
+    assert torch.equal(photo().mul(255).round(), as_tensor(expected).float())
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-300])
+    with pytest.raises(SceneError, match=r"damaged or cut short|not a readable image"):
+        photo.levels()
+
+
+def test_photos_in_tiles_are_read_as_they_are(tmp_path: Path) -> None:
+    pixels = (255 * smooth(57, 43)).astype(np.uint8)
+    spec = oiio.ImageSpec(57, 43, 3, "uint8")
+    spec.tile_width = spec.tile_height = 16
+    target = oiio.ImageOutput.create("a.tif")
+    assert target.open(str(tmp_path / "a.tif"), spec)
+    assert target.write_image(pixels)
+    assert target.close()
+    assert torch.equal(PhotoFile(tmp_path / "a.tif", (57, 43), (0.0, 0.0, 0.0)).levels(), as_tensor(pixels))
+
+
+def test_photos_that_reading_changes_have_no_levels(tmp_path: Path) -> None:
+    save(tmp_path / "deep.png", noise(43, 57, 3), "uint16")
+    save(tmp_path / "float.exr", noise(43, 57, 3), "half")
+    save(tmp_path / "alpha.png", noise(43, 57, 4), "uint8")
+    save(tmp_path / "large.png", noise(86, 114, 3), "uint8")
+    for path in sorted(tmp_path.iterdir()):
+        photo = PhotoFile(path, (57, 43), (0.0, 0.0, 0.0))
+        assert not photo.has_levels
+        assert photo().shape == (3, 43, 57)
+        with pytest.raises(SceneError, match="changed while it was used, expected 57x43 opaque pixels of 8 bits"):
+            photo.levels()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

@@ -70,3 +70,20 @@ def test_rendered_predictions_are_up_of_the_composed_levels() -> None:
     )
     for gradient, other in zip(gradients, wanted, strict=True):
         assert torch.allclose(gradient, other, atol=1e-5)  # 1e-6 seen
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_photos_may_be_levels_of_8_bits(masked: bool, tmp_path: Path) -> None:
+    levels = (255 * noise((99, 67), 0)).round().to(torch.uint8)
+    channels_last = levels.permute(1, 2, 0).contiguous().permute(2, 0, 1)
+    mask = noise((99, 67), 1)[:1] > 0.3 if masked else None
+    run = staged_run(tmp_path / "run")
+    with run.archive, run.image_cache():
+        for stage in run.plan:
+            stored = []
+            for photo in (channels_last, levels / 255):
+                images = StageImages(run, stage, SIZES, eight_bit=False, masked=masked, exact=True)
+                images.photos.put("a", photo, mask)
+                stored.append(images.photos.get("a")[0])
+                images.close()
+            assert torch.equal(*stored)
