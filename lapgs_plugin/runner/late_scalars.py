@@ -7,15 +7,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial, wraps
+from functools import wraps
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.runner.late_numbers import read
+from lapgs_plugin.runner.event_files import EventFile
+from lapgs_plugin.runner.late_numbers import LateNumber, number, read
 
 MOST_WAITING = 300
 """Scalars that wait before all of them are written: those of about a hundred iterations of the family's loops."""
@@ -33,7 +35,8 @@ class LateScalars:
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[partial[None]] = deque()
+        # Writer, number, and what gives a number to the writer.
+        self._waiting: deque[tuple[Any, Any, Callable[[Any], None]]] = deque()
         self._writing = False
 
     def replacements(self) -> list[Replacement]:
@@ -43,7 +46,11 @@ class LateScalars:
         consumer = "training() in its reports"
         # All events of a `SummaryWriter` pass through its `FileWriter`, images and histograms included.
         files = [Replacement(module.FileWriter, name, self._after_scalars, consumer) for name in FILE_METHODS]
-        return [Replacement(module.SummaryWriter, "add_scalar", self._late, consumer), *files]
+        return [
+            Replacement(module, "EventFileWriter", self._event_file, consumer),
+            Replacement(module.SummaryWriter, "add_scalar", self._late, consumer),
+            *files,
+        ]
 
     @contextmanager
     def written(self) -> Iterator[None]:
@@ -52,9 +59,21 @@ class LateScalars:
             yield
         except BaseException:
             with suppress(RuntimeError):  # a GPU that failed has no numbers, and its own error is the one to see
-                self._finish()
+                self._write()
             raise
-        self._finish()
+        self._write()
+
+    def _event_file(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def event_file(*args: Any, **kwargs: Any) -> Any:
+            writer = original(*args, **kwargs)
+            path = Path(getattr(writer, "_file_name", ""))
+            if not path.is_file():  # its folder is on another machine
+                return writer
+            writer.close()
+            return EventFile(path, writer.get_logdir(), lambda: self._writing)
+
+        return event_file
 
     def _late(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
@@ -70,12 +89,13 @@ class LateScalars:
             value = scalar_value
             if isinstance(value, Tensor) and value.numel() == 1 and value.dtype is torch.float32:
                 value = read(value)
-            if not isinstance(value, Real):
+            if not isinstance(value, (LateNumber, Real)):
                 original(writer, tag, value, global_step, walltime, *args, **kwargs)
                 return
             step = None if global_step is None else int(global_step)
             walltime = time.time() if walltime is None else walltime
-            self._waiting.append(partial(original, writer, tag, value, step, walltime, *args, **kwargs))
+            write = lambda value: original(writer, tag, value, step, walltime, *args, **kwargs)  # noqa: E731
+            self._waiting.append((writer, value, write))
             if len(self._waiting) >= MOST_WAITING:  # one wait: a read waits for all that the GPU was given
                 self._write()
 
@@ -84,23 +104,21 @@ class LateScalars:
     def _after_scalars(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
         def method(*args: Any, **kwargs: Any) -> None:
-            self._write()
+            if not self._writing:  # by this, its own event
+                self._write()
             original(*args, **kwargs)
 
         return method
 
     def _write(self) -> None:
-        if self._writing:  # by this, its own event
-            return
+        writers = {writer for writer, _, _ in self._waiting}
         self._writing = True
         try:
             while self._waiting:
-                self._waiting.popleft()()
+                _, value, write = self._waiting[0]
+                write(number(value))
+                self._waiting.popleft()  # not before its file has it: a signal may end this function
         finally:
             self._writing = False
-
-    def _finish(self) -> None:
-        writers = {scalar.args[0] for scalar in self._waiting}
-        self._write()
-        for writer in writers:
-            writer.flush()
+            for writer in writers:
+                writer.flush()
