@@ -31,6 +31,7 @@ class EventFile:
     def __init__(self, path: Path, folder: str, gathers: Callable[[], bool]) -> None:
         self._path, self._folder, self._gathers = path, folder, gathers
         self._events: list[bytes] = []
+        self._scalars: dict[str, tuple[Any, Any]] = {}  # by tag an event, and the value in it
         self._lock = threading.Lock()  # scripts may log in several threads
 
     def get_logdir(self) -> str:
@@ -42,6 +43,20 @@ class EventFile:
         self._events.append(event.SerializeToString())
         if not self._gathers():
             self.flush()
+
+    def add_scalar(self, tag: str, number: float, step: int, walltime: float) -> None:
+        """Add the event that a `SummaryWriter` makes of a number; `flush` writes it."""
+        event, value = self._scalars.get(tag) or self._add_tag(tag)
+        event.step, event.wall_time, value.simple_value = step, walltime, number
+        self._events.append(event.SerializeToString())
+
+    def _add_tag(self, tag: str) -> tuple[Any, Any]:
+        from tensorboard.compat.proto.event_pb2 import Event
+        from torch.utils.tensorboard.summary import scalar
+
+        event = Event(summary=scalar(tag, 0.0))  # type: ignore[no-untyped-call]
+        self._scalars[tag] = event, event.summary.value[0]
+        return self._scalars[tag]
 
     def flush(self) -> None:
         """Write all events to the file."""

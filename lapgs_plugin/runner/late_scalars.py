@@ -35,8 +35,8 @@ class LateScalars:
     """
 
     def __init__(self) -> None:
-        # Writer, number, and what gives a number to the writer.
-        self._waiting: deque[tuple[Any, Any, Callable[[Any], None]]] = deque()
+        self._waiting: deque[tuple[Any, Callable[[], None]]] = deque()  # writers, and what gives a scalar to each
+        self._files: list[EventFile] = []
         self._writing = False
 
     def replacements(self) -> list[Replacement]:
@@ -59,9 +59,9 @@ class LateScalars:
             yield
         except BaseException:
             with suppress(RuntimeError):  # a GPU that failed has no numbers, and its own error is the one to see
-                self._write()
+                self._finish()
             raise
-        self._write()
+        self._finish()
 
     def _event_file(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
@@ -71,7 +71,8 @@ class LateScalars:
             if not path.is_file():  # its folder is on another machine
                 return writer
             writer.close()
-            return EventFile(path, writer.get_logdir(), lambda: self._writing)
+            self._files.append(EventFile(path, writer.get_logdir(), lambda: self._writing))
+            return self._files[-1]
 
         return event_file
 
@@ -94,8 +95,15 @@ class LateScalars:
                 return
             step = None if global_step is None else int(global_step)
             walltime = time.time() if walltime is None else walltime
-            write = lambda value: original(writer, tag, value, step, walltime, *args, **kwargs)  # noqa: E731
-            self._waiting.append((writer, value, write))
+
+            def write() -> None:
+                file = None if writer.file_writer is None else writer.file_writer.event_writer
+                if isinstance(file, EventFile) and not (args or kwargs):
+                    file.add_scalar(tag, float(value), step or 0, walltime)
+                else:
+                    original(writer, tag, number(value), step, walltime, *args, **kwargs)
+
+            self._waiting.append((writer, write))
             if len(self._waiting) >= MOST_WAITING:  # one wait: a read waits for all that the GPU was given
                 self._write()
 
@@ -104,21 +112,27 @@ class LateScalars:
     def _after_scalars(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
         def method(*args: Any, **kwargs: Any) -> None:
-            if not self._writing:  # by this, its own event
-                self._write()
+            self._write()
             original(*args, **kwargs)
 
         return method
 
     def _write(self) -> None:
-        writers = {writer for writer, _, _ in self._waiting}
+        if self._writing:  # by this, its own event
+            return
         self._writing = True
         try:
             while self._waiting:
-                _, value, write = self._waiting[0]
-                write(number(value))
+                _, write = self._waiting[0]
+                write()
                 self._waiting.popleft()  # not before its file has it: a signal may end this function
         finally:
             self._writing = False
-            for writer in writers:
-                writer.flush()
+            for file in self._files:
+                file.flush()
+
+    def _finish(self) -> None:
+        writers = {writer for writer, _ in self._waiting}
+        self._write()
+        for writer in writers:
+            writer.flush()
