@@ -99,45 +99,40 @@ class _Copies:
     """Copy numbers on their device into one tensor, to read them together.
 
     Args:
-        memory: tensors (`READ_TOGETHER`,), of which one is used meanwhile.
+        memory: tensors (`READ_TOGETHER`,) and their elements, of which one tensor is used until the numbers are read.
         like: a tensor of the kind of the numbers.
     """
 
     def __init__(self, memory: list[tuple[Tensor, tuple[Tensor, ...]]], like: Tensor) -> None:
-        self._memory = memory
-        self._numbers, self._places = memory.pop() if memory else _new_memory(like)
+        self._memory, self._count = memory, 0
+        self._numbers, self._elements = memory.pop() if memory else _new_memory(like)
         self._values: list[float] | None = None
-        self._count = 0
-        self._known: dict[int, tuple[weakref.ref[Tensor], int, LateNumber]] = {}
+        self._results: dict[int, tuple[weakref.ref[Tensor], int, LateNumber]] = {}
 
-    @property
-    def takes_more(self) -> bool:
-        """Whether there is a place for another number."""
-        return self._values is None and self._count < READ_TOGETHER
-
-    def add(self, tensor: Tensor) -> LateNumber:
-        """Return the number in a tensor, late; it may change afterwards."""
-        if not tensor.requires_grad or tensor.is_leaf:  # compiled code may write to it
-            return self._copy(tensor)
-        known = self._known.get(id(tensor))
-        if known is not None and known[0]() is tensor and known[1] == tensor._version:
-            return known[2]  # loops read their loss twice
-        late = self._copy(tensor)
-        self._known[id(tensor)] = weakref.ref(tensor), tensor._version, late
+    def add(self, tensor: Tensor) -> LateNumber | None:
+        """Return the number in a tensor, which may change afterwards; None after a read, or without an element left."""
+        if self._values is not None or self._count == READ_TOGETHER:
+            return None
+        # Compiled code may write to other tensors without a new version.
+        is_result = tensor.requires_grad and not tensor.is_leaf
+        if is_result and (known := self._results.get(id(tensor))) is not None:
+            reference, version, late = known
+            if reference() is tensor and version == tensor._version:
+                return late  # loops read their loss twice
+        source = tensor.detach() if torch.is_grad_enabled() else tensor
+        self._elements[self._count].copy_(source if source.ndim == 0 else source.reshape(()))
+        late = LateNumber(partial(self._read, self._count))
+        self._count += 1
+        if is_result:
+            self._results[id(tensor)] = weakref.ref(tensor), tensor._version, late
         return late
 
-    def _copy(self, tensor: Tensor) -> LateNumber:
-        index, self._count = self._count, self._count + 1
-        if torch.is_grad_enabled():
-            tensor = tensor.detach()
-        self._places[index].copy_(tensor if tensor.ndim == 0 else tensor.reshape(()))
-        return LateNumber(partial(self._value, index))
-
-    def _value(self, index: int) -> float:
+    def _read(self, index: int) -> float:
         with _lock:
             if self._values is None:
                 self._values = self._numbers.tolist()
-                self._memory.append((self._numbers, self._places))
+                self._memory.append((self._numbers, self._elements))
+                self._results.clear()
         return self._values[index]
 
 
@@ -160,8 +155,9 @@ def read(tensor: Any) -> Any:
     kind = tensor.device, tensor.dtype
     with _lock:
         copies = _copies.get(kind)
-        if copies is None or not copies.takes_more:
-            copies = _copies[kind] = _Copies(_memory.setdefault(kind, []), tensor)
+        if copies is not None and (late := copies.add(tensor)) is not None:
+            return late
+        copies = _copies[kind] = _Copies(_memory.setdefault(kind, []), tensor)
         return copies.add(tensor)
 
 
