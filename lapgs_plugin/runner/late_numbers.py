@@ -7,10 +7,14 @@ import inspect
 import logging
 import numbers
 import operator
+import threading
+import weakref
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.logged_numbers import ELAPSED, ELAPSED_NOW, NUMBER, READ, RECORD, LateNumbers
@@ -21,6 +25,9 @@ logger = logging.getLogger(__name__)
 
 MOST_PENDING = 100
 """Numbers that may depend on one another before the first of them is waited for."""
+
+READ_TOGETHER = 64
+"""Most numbers that are copied from a device at once."""
 
 
 def _methods(compute: Callable[[Any, Any], Any]) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
@@ -68,11 +75,17 @@ class LateNumber:
 numbers.Real.register(LateNumber)  # loggers and progress bars ask for a number before they convert it
 
 
+_KINDS = LateNumber, float, int
+
+
 def _computed(compute: Callable[[Any, Any], Any], first: Any, second: Any) -> Any:
     """Return a result of two numbers of which one is late: late itself, unless the other is no number."""
-    pending = sum(value.pending for value in (first, second) if isinstance(value, LateNumber))
-    both = all(isinstance(value, (int, float, LateNumber)) for value in (first, second))
-    if not both or pending > MOST_PENDING:
+    if not (isinstance(first, _KINDS) and isinstance(second, _KINDS)):
+        return compute(number(first), number(second))
+    pending = (first.pending if isinstance(first, LateNumber) else 0) + (
+        second.pending if isinstance(second, LateNumber) else 0
+    )
+    if pending > MOST_PENDING:
         return compute(number(first), number(second))
     return LateNumber(lambda: compute(number(first), number(second)), pending + 1)
 
@@ -82,11 +95,70 @@ def number(value: Any) -> Any:
     return float(value) if isinstance(value, LateNumber) else value
 
 
+class _Copies:
+    """Copy numbers on their device into one tensor, to read them together.
+
+    Args:
+        memory: tensors (`READ_TOGETHER`,) and their elements, of which one tensor is used until the numbers are read.
+        like: a tensor of the kind of the numbers.
+    """
+
+    def __init__(self, memory: list[tuple[Tensor, tuple[Tensor, ...]]], like: Tensor) -> None:
+        self._memory, self._count = memory, 0
+        self._numbers, self._elements = memory.pop() if memory else _new_memory(like)
+        self._values: list[float] | None = None
+        self._results: dict[int, tuple[weakref.ref[Tensor], int, LateNumber]] = {}
+
+    def add(self, tensor: Tensor) -> LateNumber | None:
+        """Return the number in a tensor, which may change afterwards; None after a read, or without an element left."""
+        if self._values is not None or self._count == READ_TOGETHER:
+            return None
+        # Compiled code may write to other tensors without a new version.
+        is_result = tensor.requires_grad and not tensor.is_leaf
+        if is_result and (known := self._results.get(id(tensor))) is not None:
+            reference, version, late = known
+            if reference() is tensor and version == tensor._version:
+                return late  # loops read their loss twice
+        source = tensor.detach() if torch.is_grad_enabled() else tensor
+        self._elements[self._count].copy_(source if source.ndim == 0 else source.reshape(()))
+        late = LateNumber(partial(self._read, self._count))
+        self._count += 1
+        if is_result:
+            self._results[id(tensor)] = weakref.ref(tensor), tensor._version, late
+        return late
+
+    def _read(self, index: int) -> float:
+        with _lock:
+            if self._values is None:
+                self._values = self._numbers.tolist()
+                self._memory.append((self._numbers, self._elements))
+                self._results.clear()
+        return self._values[index]
+
+
+def _new_memory(like: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Return a tensor on the device of another, and its elements."""
+    with torch.inference_mode(False):  # it is written to in other modes, too
+        numbers = like.new_empty(READ_TOGETHER)
+        return numbers, numbers.unbind()
+
+
+_lock = threading.Lock()
+_memory: dict[tuple[torch.device, torch.dtype], list[tuple[Tensor, tuple[Tensor, ...]]]] = {}
+_copies: dict[tuple[torch.device, torch.dtype], _Copies] = {}
+
+
 def read(tensor: Any) -> Any:
     """Return the number in a tensor, late."""
     if not isinstance(tensor, Tensor) or tensor.numel() != 1 or not tensor.is_floating_point():
         return tensor.item()
-    return LateNumber(tensor.detach().clone().item)  # a copy, as the loop may change the tensor
+    kind = tensor.device, tensor.dtype
+    with _lock:
+        copies = _copies.get(kind)
+        if copies is not None and (late := copies.add(tensor)) is not None:
+            return late
+        copies = _copies[kind] = _Copies(_memory.setdefault(kind, []), tensor)
+        return copies.add(tensor)
 
 
 def elapsed(start: Any, end: Any) -> Any:

@@ -7,15 +7,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial, wraps
+from functools import wraps
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.checkouts.attachment import Replacement
-from lapgs_plugin.runner.late_numbers import read
+from lapgs_plugin.runner.event_files import EventFile
+from lapgs_plugin.runner.late_numbers import LateNumber, number, read
 
 MOST_WAITING = 300
 """Scalars that wait before all of them are written: those of about a hundred iterations of the family's loops."""
@@ -33,7 +35,8 @@ class LateScalars:
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[partial[None]] = deque()
+        self._waiting: deque[tuple[Any, Callable[[], None]]] = deque()  # writers, and what gives a scalar to each
+        self._files: list[EventFile] = []
         self._writing = False
 
     def replacements(self) -> list[Replacement]:
@@ -43,7 +46,11 @@ class LateScalars:
         consumer = "training() in its reports"
         # All events of a `SummaryWriter` pass through its `FileWriter`, images and histograms included.
         files = [Replacement(module.FileWriter, name, self._after_scalars, consumer) for name in FILE_METHODS]
-        return [Replacement(module.SummaryWriter, "add_scalar", self._late, consumer), *files]
+        return [
+            Replacement(module, "EventFileWriter", self._event_file, consumer),
+            Replacement(module.SummaryWriter, "add_scalar", self._late, consumer),
+            *files,
+        ]
 
     @contextmanager
     def written(self) -> Iterator[None]:
@@ -55,6 +62,19 @@ class LateScalars:
                 self._finish()
             raise
         self._finish()
+
+    def _event_file(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def event_file(*args: Any, **kwargs: Any) -> Any:
+            writer = original(*args, **kwargs)
+            path = Path(getattr(writer, "_file_name", ""))
+            if not path.is_file():  # its folder is on another machine
+                return writer
+            writer.close()
+            self._files.append(EventFile(path, writer.get_logdir(), lambda: self._writing))
+            return self._files[-1]
+
+        return event_file
 
     def _late(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
@@ -70,12 +90,20 @@ class LateScalars:
             value = scalar_value
             if isinstance(value, Tensor) and value.numel() == 1 and value.dtype is torch.float32:
                 value = read(value)
-            if not isinstance(value, Real):
+            if not isinstance(value, (LateNumber, Real)):
                 original(writer, tag, value, global_step, walltime, *args, **kwargs)
                 return
             step = None if global_step is None else int(global_step)
             walltime = time.time() if walltime is None else walltime
-            self._waiting.append(partial(original, writer, tag, value, step, walltime, *args, **kwargs))
+
+            def write() -> None:
+                file = None if writer.file_writer is None else writer.file_writer.event_writer
+                if isinstance(file, EventFile) and not (args or kwargs):
+                    file.add_scalar(tag, float(value), step or 0, walltime)
+                else:
+                    original(writer, tag, number(value), step, walltime, *args, **kwargs)
+
+            self._waiting.append((writer, write))
             if len(self._waiting) >= MOST_WAITING:  # one wait: a read waits for all that the GPU was given
                 self._write()
 
@@ -95,12 +123,16 @@ class LateScalars:
         self._writing = True
         try:
             while self._waiting:
-                self._waiting.popleft()()
+                _, write = self._waiting[0]
+                write()
+                self._waiting.popleft()  # not before its file has it: a signal may end this function
         finally:
             self._writing = False
+            for file in self._files:
+                file.flush()
 
     def _finish(self) -> None:
-        writers = {scalar.args[0] for scalar in self._waiting}
+        writers = {writer for writer, _ in self._waiting}
         self._write()
         for writer in writers:
             writer.flush()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import operator
 import re
 import traceback
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -14,10 +16,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.runner import late_numbers
-from lapgs_plugin.runner.late_numbers import LateNumber, reading_late
+from lapgs_plugin.runner.late_numbers import LateNumber, read, reading_late
 
 OPERATIONS = [operator.add, operator.sub, operator.mul, operator.truediv]
 NUMBERS = st.floats(0.125, 100.0)
@@ -58,6 +61,57 @@ def test_few_numbers_are_pending() -> None:
         total += LateNumber(lambda: 1.0)
     assert total.pending <= late_numbers.MOST_PENDING + 1
     assert float(total) == 20_000
+
+
+@contextmanager
+def counting(operations: Counter[str]) -> Iterator[None]:
+    class Counting(TorchDispatchMode):
+        def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            operations[function.overloadpacket.__name__] += 1
+            return function(*args, **kwargs or {})
+
+    with Counting():
+        yield
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+@pytest.mark.parametrize("inference", [False, True])
+def test_numbers_of_tensors(dtype: torch.dtype, shape: tuple[int, ...], inference: bool) -> None:
+    """Of tensors that change afterwards, read in any order, many before the first is waited for and one by one."""
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.ones((), dtype=dtype, requires_grad=True)
+    for count in (1, 3, 200, 64, 65):
+        plain, late = [], []
+        with torch.inference_mode(inference):
+            for i in range(count):
+                tensor = torch.randn(shape, generator=generator).to(dtype)
+                tensor = tensor * weight if i % 2 else tensor
+                plain.append(tensor.item())
+                late.append(read(tensor))
+                with torch.no_grad():
+                    tensor += 1.0
+                plain.append(tensor.item())
+                late.append(read(tensor))
+        order = torch.randperm(2 * count, generator=generator).tolist()
+        assert [float(late[i]) for i in order] == [plain[i] for i in order]
+
+
+def test_few_operations_read_many_numbers() -> None:
+    losses, operations = torch.rand(50, requires_grad=True).unbind(), Counter[str]()
+    with counting(operations):
+        numbers = [read(loss) for loss in losses for _ in range(3)]  # in a mean, and twice in a report
+    assert operations["copy_"] == 50
+    with counting(operations):
+        assert [float(number) for number in numbers] == [loss.item() for loss in losses for _ in range(3)]
+    assert operations["_local_scalar_dense"] == 150, "those of the test"
+
+
+def test_other_numbers_are_not_late() -> None:
+    assert type(read(torch.tensor(3))) is int
+    assert read(np.float32(0.5)) == 0.5
+    with pytest.raises(RuntimeError):
+        read(torch.zeros(2))
 
 
 def test_loggers_take_it() -> None:

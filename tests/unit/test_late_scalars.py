@@ -51,6 +51,9 @@ def log(folder: Path, number: Callable[[float], Any]) -> None:
         if step % 60 == 59:
             writer.add_histogram("histogram", torch.arange(3.0), step)
             writer.add_scalar("half", changing.bfloat16())
+            writer.add_image("image", torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(step)), step)
+            if step > 100:
+                writer.flush()
     writer.close()
     writer.add_scalar("another", number(0.5), 1)
     writer.close()
@@ -67,8 +70,48 @@ def test_files_have_the_same(tmp_path: Path) -> None:
         ]
         for name in ("plain", "late")
     ]
-    assert [len(events) for events in contents[0]] == [250 * 3 + 4 * 2, 1]
+    assert [len(events) for events in contents[0]] == [250 * 3 + 4 * 3, 1]
     assert contents[0] == contents[1]
+
+
+def test_files_grow_with_their_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that TensorBoard shows a run that goes on, and little is missing of one that is killed."""
+    monkeypatch.setattr(late_scalars, "MOST_WAITING", 10)
+    with late():
+        writer = SummaryWriter(str(tmp_path))
+        for step in range(25):
+            writer.add_scalar("loss", 0.5, step)
+            assert len(losses_of(tmp_path)) == (step + 1) // 10 * 10
+        writer.add_text("text", "of the script")
+        (events,) = events_of(tmp_path)
+        assert [event.summary.value[0].tag for event in events[-2:]] == ["loss", "text/text_summary"]
+        assert len(events) == 26
+    writer.add_scalar("loss", 0.5, 25)  # after training
+    assert len(events_of(tmp_path)[0]) == 27
+
+
+def test_a_writer_from_before_training(tmp_path: Path) -> None:
+    writer = SummaryWriter(str(tmp_path))
+    writer.add_scalar("loss", 0.5, 0)
+    with late():
+        writer.add_scalar("loss", LateNumber(lambda: 1.5), 1)
+        writer.add_histogram("histogram", torch.arange(3.0), 2)
+        writer.add_scalar("loss", 2.5, 3)
+    writer.add_scalar("loss", 3.5, 4)
+    writer.close()
+    (events,) = events_of(tmp_path)
+    assert [event.step for event in events] == list(range(5))
+
+
+def test_a_folder_of_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has files that only TensorBoard's own writer can write."""
+    monkeypatch.setattr(Path, "is_file", lambda path: False)
+    with late():
+        writer = SummaryWriter(str(tmp_path))
+        for step in range(3):
+            writer.add_scalar("loss", LateNumber(lambda: 0.5), step)
+        writer.close()
+    assert losses_of(tmp_path) == [(step, 0.5) for step in range(3)]
 
 
 def test_nothing_is_read_before_many_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
