@@ -16,7 +16,6 @@ import torch
 from lapgs_plugin.checkouts.masked_statements import UPDATE, VISIBLE, MaskedUpdates, VisibleIndices, keeps_masks
 from lapgs_plugin.checkouts.rewriting import rewritten, tree_of
 from lapgs_plugin.ops.masked_updates import update_rows
-from lapgs_plugin.ops.masked_updates.in_torch import Update
 
 Place = tuple[str, str, int]
 
@@ -70,8 +69,8 @@ class VisibleRows:
         return self._changed[renderer]
 
 
-def _update(mask: Any, *updates: tuple[Any, ...]) -> bool:
-    return update_rows(mask, [Update(*update) for update in updates])
+def _update(mask: Any, *updates: Any) -> bool:
+    return update_rows(mask, updates)
 
 
 def _place(code: CodeType) -> Place:
