@@ -286,15 +286,18 @@ for n in (1, 511, 1500):
     ]
     plain = [*cases[:5], (False, first), (True, last, None, rows), (False, last, None, whole)]
     plain.append((True, wide[:, 3:].abs()))
-    targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(9)]
-                         for _ in range(2))
-    update_rows_triton(mask, [Update(target, *case) for target, case in zip(targets, cases)])
-    for target, case in zip(expected, plain):
-        value = case[1] * case[3] if len(case) > 3 else case[1]
-        after = torch.maximum(target, torch.as_tensor(value)) if case[0] else target + value
-        target[mask] = after[mask]
-    for one, other in zip(targets, expected):
-        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+    for together in (1, 2, 3, 9):  # as many as a launch has, fewer and more
+        targets, expected = ([torch.randn(n, 1, generator=torch.Generator(DEVICE).manual_seed(i)) for i in range(9)]
+                             for _ in range(2))
+        updates = [Update(target, *case) for target, case in zip(targets, cases)]
+        for start in range(0, 9, together):
+            update_rows_triton(mask, updates[start : start + together])
+        for target, case in zip(expected, plain):
+            value = case[1] * case[3] if len(case) > 3 else case[1]
+            after = torch.maximum(target, torch.as_tensor(value)) if case[0] else target + value
+            target[mask] = after[mask]
+        for one, other in zip(targets, expected):
+            torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 if DEVICE == "cuda":
     assert triton_works.passes_on(torch.device("cuda"))
 """
@@ -433,9 +436,12 @@ assembly, in_triton.launch = [], compiled
 rows, wide = torch.ones(5, 1), torch.ones(5, 4)
 updates = [Update(rows, False, wide, (0, 2)), Update(rows, True, wide, (2, 4), rows)]
 updates.append(Update(rows, False, rows, None, rows))
-in_triton.update_rows_triton(torch.ones(5, dtype=torch.bool), updates)
-assert "mul.f32" in assembly[0] and "add.f32" in assembly[0] and "sqrt.rn.f32" in assembly[0]
-assert "fma" not in assembly[0]
+for several in (updates, updates[1:2]):
+    in_triton.update_rows_triton(torch.ones(5, dtype=torch.bool), several)
+for text in assembly:
+    assert "mul.f32" in text and "add.f32" in text and "sqrt.rn.f32" in text
+    assert "fma" not in text
+assert len(assembly) == 2
 """
 OPTIMIZER = """
 import copy

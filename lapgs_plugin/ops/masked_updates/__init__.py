@@ -130,6 +130,7 @@ def triton_works(device: torch.device) -> float:
             Update(targets[5], False, rows, None, rows),
             Update(targets[6], True, points, (3, None)),
         ]
-        update(mask, updates)
+        update(mask, updates[:1])  # by a kernel of its own
+        update(mask, updates[1:])
         both.append(targets)
     return largest((one - other).abs() for one, other in zip(*both, strict=True))
