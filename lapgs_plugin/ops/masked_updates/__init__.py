@@ -12,7 +12,7 @@ from lapgs_plugin.ops.masked_updates.in_torch import Update, read_columns, updat
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 READABLE = torch.float32, torch.int32
-HASHABLE = int, float, tuple
+NUMBERS = int, float
 
 
 _fitting: set[tuple[Any, ...]] = set()
@@ -49,17 +49,17 @@ def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
 
 def _looks(mask: Any, updates: Sequence[Update]) -> tuple[Any, ...]:
     """Return all that decides whether a mask and updates fit, besides gradients and places in memory."""
-    values = [mask]
-    for target, _, source, columns, factor in updates:
-        values += target, source, columns, factor
-    return tuple(
-        [
-            (value.shape, value.dtype, value.device, value.is_contiguous())
-            if isinstance(value, Tensor)
-            else (type(value), value if isinstance(value, HASHABLE) else None)
-            for value in values
-        ]
-    )
+    values, columns = [mask], []
+    for target, _, source, read, factor in updates:
+        values += target, source, factor
+        columns.append(read)
+    looks = [
+        (value.shape, value.dtype, value.get_device(), value.is_contiguous())
+        if isinstance(value, Tensor)
+        else value is not None and (type(value), value if isinstance(value, NUMBERS) else None)
+        for value in values
+    ]
+    return (*columns, *looks)
 
 
 def _is_mask(mask: Any) -> bool:
