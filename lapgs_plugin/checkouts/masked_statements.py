@@ -16,7 +16,7 @@ import ast
 import copy
 from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lapgs_plugin.checkouts.rewriting import Change, StatementsChange, call
 
@@ -68,7 +68,7 @@ class MaskedUpdates(StatementsChange):
         model.add(shown)
 
     Args:
-        methods: trees of the model's, by name, of which calls after other such statements may be replaced, too.
+        methods: trees of the model's methods by name; where one is called beside such statements, it may be replaced.
     """
 
     def __init__(self, methods: Mapping[str, ast.FunctionDef]) -> None:
@@ -84,7 +84,7 @@ class MaskedUpdates(StatementsChange):
             return _Updates(statement, update.mask, [update.arguments])
         match statement:
             case ast.Expr(ast.Call(ast.Attribute(_, name)) as called) if name in self._methods:
-                return _Updates(statement, *_updates_in(self._methods[name], called))
+                return _updates_by(statement, called, self._methods[name])
         return _Updates(statement)
 
     def _updated(self, mask: str | None, run: Sequence[_Updates]) -> list[ast.stmt]:
@@ -110,22 +110,24 @@ class _Substitution(ast.NodeTransformer):
         return copy.deepcopy(self._values[node.id])
 
 
-def _updates_in(method: ast.FunctionDef, called: ast.Call) -> tuple[Any, ...]:
-    """Return the mask, updates and method of a call, by the caller's variables; nothing if it does something else."""
+def _updates_by(statement: ast.stmt, called: ast.Call, method: ast.FunctionDef) -> _Updates:
+    """Return what a statement does that calls a method, by the variables of the caller."""
+    other = _Updates(statement)
     body = method.body[1:] if ast.get_docstring(method) is not None else method.body
     updates = [update for line in body if (update := _update(line)) is not None]
+    parameters = [parameter.arg for parameter in method.args.args]
     assert isinstance(called.func, ast.Attribute)
-    parameters, arguments = [one.arg for one in method.args.args], [called.func.value, *called.args]
-    if not updates or len(updates) < len(body) or len(parameters) != len(arguments) or called.keywords:
-        return ()
-    values = dict(zip(parameters, arguments, strict=True))
-    mask, used = values.get(updates[0].mask), {name for update in updates for name in _names(update)}
-    if not isinstance(mask, ast.Name) or not used <= values.keys() or not all(map(_is_value, arguments)):
-        return ()
-    if any(update.mask != updates[0].mask for update in updates):
-        return ()
-    change = _Substitution(values)
-    return mask.id, [[change.visit(copy.deepcopy(part)) for part in one.arguments] for one in updates], called.func
+    arguments = [called.func.value, *called.args]
+    if called.keywords or len(parameters) != len(arguments) or not all(map(_is_value, arguments)):
+        return other
+    values, masks = dict(zip(parameters, arguments, strict=True)), {update.mask for update in updates}
+    if len(updates) < len(body) or len(masks) != 1 or not set().union(*map(_names, updates)) <= values.keys():
+        return other
+    mask, change = values.get(masks.pop()), _Substitution(values)
+    if not isinstance(mask, ast.Name):
+        return other
+    own = [[change.visit(copy.deepcopy(part)) for part in update.arguments] for update in updates]
+    return _Updates(statement, mask.id, own, called.func)
 
 
 def _names(update: _Update) -> set[str]:
