@@ -264,6 +264,32 @@ def test_updates_that_depend_on_each_other_or_have_gradients() -> None:
     assert rows.tolist() == [2, 1]
 
 
+def test_updates_of_the_same_size_are_looked_at_again() -> None:
+    mask, rows, points = torch.tensor([True, False, True]), torch.ones(3, 1), torch.ones(3, 4)
+
+    def done(target: Any = rows, source: Any = points, columns: Any = (0, 2), factor: Any = None) -> bool:
+        return update_rows(mask, [Update(target, False, source, columns, factor), Update(torch.ones(3), False, 1)])
+
+    with torch.no_grad():
+        for _ in range(2):
+            assert done()
+            assert not done(target=torch.ones(3, 1, dtype=torch.float64))
+            assert not done(target=torch.ones(3))
+            assert not done(target=torch.ones(3, 2)[:, :1])
+            assert not done(factor=[1.0])
+            assert not done(source=points.int())
+            assert not done(source=torch.ones(4, 3).T)
+            assert not done(source=[1.0, 1.0, 1.0], columns=None)
+            assert not done(columns=(0, 3))
+            assert not done(factor=rows)
+            assert done(source=1, columns=None)
+            assert not done(source=True, columns=None)
+            assert done(source=torch.nn.Parameter(points))
+    assert not done(source=torch.nn.Parameter(points))
+    updated = 1 + 2 * (1 + 2 * 2**0.5)
+    assert rows[:, 0].tolist() == pytest.approx([updated, 1, updated], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     "statement",
     [

@@ -13,12 +13,10 @@ from lapgs_plugin.ops.self_check import largest, matches_reference
 
 READABLE = torch.float32, torch.int32
 NUMBERS = int, float
-
-
-_fitting: set[tuple[Any, ...]] = set()
-"""How masks and updates look that fit."""
 MOST_LOOKS = 256
-"""How many are remembered: they have the number of Gaussians, which densification changes."""
+"""Most descriptions of updates that are remembered. They have the number of Gaussians, which densification changes."""
+
+_fitting: set[tuple[Any, ...]] = set()  # descriptions by `_looks` of masks and updates that fit
 
 
 def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
@@ -26,8 +24,8 @@ def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
 
     Args:
         mask: (n,) bool, true for the rows to update.
-        updates: of different tensors, none of which another update reads; as tuples, too. Nothing is changed if they or
-            the mask are otherwise than described, if gradients would be recorded, or if n is 0.
+        updates: of different tensors, none of which another update reads; or tuples of their fields. Nothing is changed
+            if they or the mask are otherwise than described, if gradients would be recorded, or if n is 0.
     """
     looks = _looks(mask, updates)
     if torch.is_grad_enabled() or looks not in _fitting:
