@@ -7,13 +7,14 @@ Loops of the family gather statistics of the Gaussians that a view shows:
     self.denom[shown] += 1
 
 Each `x[shown]` of a mask waits for the GPU, which has to say how many rows there are, and is several launches.
+Some of these statements are in a method of the model, which the loop calls after others of them.
 """
 
 from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from lapgs_plugin.checkouts.rewriting import Change, StatementsChange, call
 
 UPDATE = "_lapgs_update"
 """Name of the function that updates the rows, and returns whether it did."""
+KNOWN = "_lapgs_known"
+"""Name of the function that returns whether a method is the one whose statements are known."""
 VISIBLE = "_lapgs_visible"
 """Name of the function that takes the place of `(radii > 0).nonzero()`."""
 KEY = "visibility_filter"
@@ -41,27 +44,105 @@ class _Update(NamedTuple):
     arguments: tuple[ast.expr, ...]
 
 
+class _Updates(NamedTuple):
+    """Describe what a statement does, an update or a call of a method that does nothing but updates.
+
+    Attributes:
+        statement: itself.
+        mask: variable of the mask; None if it does something else.
+        updates: arguments of each.
+        method: what is called.
+    """
+
+    statement: ast.stmt
+    mask: str | None = None
+    updates: Sequence[Sequence[ast.expr]] = ()
+    method: ast.expr | None = None
+
+
 class MaskedUpdates(StatementsChange):
     """Replace runs of statements that update rows of a mask, where the same can be done without listing the rows.
 
-    if not UPDATE(shown, (self.sums, False, points.grad, (None, 2), None), (self.denom, False, 1, None, None)):
-        self.sums[shown] += torch.norm(points.grad[shown, :2], dim=-1, keepdim=True)
-        self.denom[shown] += 1
+    if not (KNOWN(model.add) and UPDATE(shown, (self.largest, True, radii, None, None), (model.views, ...))):
+        self.largest[shown] = torch.max(self.largest[shown], radii[shown])
+        model.add(shown)
+
+    Args:
+        methods: trees of the model's methods by name; where one is called beside such statements, it may be replaced.
     """
 
+    def __init__(self, methods: Mapping[str, ast.FunctionDef]) -> None:
+        self._methods = methods
+
     def _replaced(self, statements: list[ast.stmt]) -> list[ast.stmt]:
-        runs = groupby(statements, lambda statement: update.mask if (update := _update(statement)) else None)
+        runs = groupby((self._updates_of(statement) for statement in statements), lambda updates: updates.mask)
         replaced = [self._updated(mask, list(run)) for mask, run in runs]
         return [statement for run in replaced for statement in run]
 
-    def _updated(self, mask: str | None, statements: list[ast.stmt]) -> list[ast.stmt]:
-        if mask is None:
+    def _updates_of(self, statement: ast.stmt) -> _Updates:
+        if (update := _update(statement)) is not None:
+            return _Updates(statement, update.mask, [update.arguments])
+        match statement:
+            case ast.Expr(ast.Call(ast.Attribute(_, name)) as called) if name in self._methods:
+                return _updates_by(statement, called, self._methods[name])
+        return _Updates(statement)
+
+    def _updated(self, mask: str | None, run: Sequence[_Updates]) -> list[ast.stmt]:
+        statements, methods = [one.statement for one in run], [one.method for one in run if one.method is not None]
+        if mask is None or len(methods) == len(run):  # what a method does by itself is replaced in it
             return statements
         self.changes += len(statements)
-        updates = [update for statement in statements if (update := _update(statement))]
-        arguments = [ast.Tuple(copy.deepcopy(list(update.arguments)), ast.Load()) for update in updates]
-        done = call(UPDATE, ast.Name(mask, ast.Load()), *arguments)
+        updates = [ast.Tuple(copy.deepcopy(list(update)), ast.Load()) for one in run for update in one.updates]
+        done: ast.expr = call(UPDATE, ast.Name(mask, ast.Load()), *updates)
+        if methods:
+            done = ast.BoolOp(ast.And(), [*(call(KNOWN, copy.deepcopy(method)) for method in methods), done])
         return [ast.copy_location(ast.If(ast.UnaryOp(ast.Not(), done), statements, []), statements[0])]
+
+
+class _Substitution(ast.NodeTransformer):
+    """Replace variables by expressions."""
+
+    def __init__(self, values: Mapping[str, ast.expr]) -> None:
+        self._values = values
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Return what takes the place of a variable."""
+        return copy.deepcopy(self._values[node.id])
+
+
+def _updates_by(statement: ast.stmt, called: ast.Call, method: ast.FunctionDef) -> _Updates:
+    """Return what a statement does that calls a method, by the variables of the caller."""
+    other = _Updates(statement)
+    body = method.body[1:] if ast.get_docstring(method) is not None else method.body
+    updates = [update for line in body if (update := _update(line)) is not None]
+    parameters = [parameter.arg for parameter in method.args.args]
+    assert isinstance(called.func, ast.Attribute)
+    arguments = [called.func.value, *called.args]
+    if called.keywords or len(parameters) != len(arguments) or not all(map(_is_value, arguments)):
+        return other
+    values, masks = dict(zip(parameters, arguments, strict=True)), {update.mask for update in updates}
+    if len(updates) < len(body) or len(masks) != 1 or not set().union(*map(_names, updates)) <= values.keys():
+        return other
+    mask, change = values.get(masks.pop()), _Substitution(values)
+    if not isinstance(mask, ast.Name):
+        return other
+    own = [[change.visit(copy.deepcopy(part)) for part in update.arguments] for update in updates]
+    return _Updates(statement, mask.id, own, called.func)
+
+
+def _names(update: _Update) -> set[str]:
+    nodes = [node for part in update.arguments for node in ast.walk(part)]
+    return {node.id for node in nodes if isinstance(node, ast.Name)}
+
+
+def _is_value(expression: ast.expr) -> bool:
+    """Return whether an expression is a variable, its attribute or item, or a constant: it may be read twice."""
+    match expression:
+        case ast.Name() | ast.Constant():
+            return True
+        case ast.Attribute(value) | ast.Subscript(value, ast.Constant()):
+            return _is_value(value)
+    return False
 
 
 class VisibleIndices(Change):

@@ -123,8 +123,7 @@ class StageReplacements:
         names = {
             name for renderer in profile.renderers for name in (*profile.script_names(renderer), renderer.__name__)
         }
-        statistics = getattr(profile.model, STATISTICS, None)
-        rows.note_loop(profile.training, names, {} if statistics is None else {STATISTICS: statistics})
+        rows.note_loop(profile.training, names, _statistics(profile))
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""
@@ -159,7 +158,9 @@ class StageReplacements:
     def _make_training(self, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return the replacement of the script's `training`, which hands its call to `train` instead of running it."""
         rows = self._context.wrapper.rows
-        changed = original if rows is None else rows.updating(reading_late(original))
+        changed = original
+        if rows is not None:
+            changed = rows.updating(reading_late(original), _statistics(self._context.adapter.profile))
         if self._context.request.settings.fused_ssim:
             changed = checkout_loss.in_one_kernel(changed)
         changed = checkout_noise.in_one_kernel(changed)
@@ -250,6 +251,12 @@ class StageReplacements:
 def _is_last(stage: RunningStage | None) -> TypeGuard[RunningStage]:
     """Return whether a stage runs in the last iteration of its call of `training`."""
     return stage is not None and not stage.has_more
+
+
+def _statistics(profile: Profile) -> dict[str, Callable[..., Any]]:
+    """Return the model's method that gathers statistics of the Gaussians that a view shows, by its name."""
+    method = getattr(profile.model, STATISTICS, None)
+    return {} if method is None else {STATISTICS: method}
 
 
 def _returns_nothing_used(name: str, profile: Profile) -> bool:

@@ -7,18 +7,26 @@ tensors can be updated by the mask, they are; where not, the statement is execut
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Collection, Mapping
 from types import CodeType
 from typing import Any
 
 import torch
 
-from lapgs_plugin.checkouts.masked_statements import UPDATE, VISIBLE, MaskedUpdates, VisibleIndices, keeps_masks
+from lapgs_plugin.checkouts.masked_statements import (
+    KNOWN,
+    UPDATE,
+    VISIBLE,
+    MaskedUpdates,
+    VisibleIndices,
+    keeps_masks,
+)
 from lapgs_plugin.checkouts.rewriting import rewritten, tree_of
 from lapgs_plugin.ops.masked_updates import update_rows
-from lapgs_plugin.ops.masked_updates.in_torch import Update
 
 Place = tuple[str, str, int]
+Methods = Mapping[str, Callable[..., Any]]
 
 
 class VisibleRows:
@@ -28,15 +36,26 @@ class VisibleRows:
         self._loop: Place | None = None  # the training function, if it needs no indices
         self._changed: dict[Callable[..., Any], Callable[..., Any]] = {}
 
-    def updating(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a training function or a method of a model that updates rows by their mask."""
+    def updating(self, function: Callable[..., Any], methods: Methods | None = None) -> Callable[..., Any]:
+        """Return a training function or a method of a model that updates rows by their mask.
+
+        Args:
+            function: the function.
+            methods: of the model, which do nothing but such updates, as a rule. Where the function calls one after
+                others, all are one update.
+        """
         if getattr(function, "__globals__", {}).get("torch") is not torch:
             return function
-        return rewritten(function, lambda _: MaskedUpdates(), {UPDATE: _update})
+        trees = _trees(methods or {})
+        known = {_place(method.__code__) for name, method in (methods or {}).items() if name in trees}
 
-    def note_loop(
-        self, training: Callable[..., Any], renderers: Collection[str], methods: Mapping[str, Callable[..., Any]]
-    ) -> None:
+        def is_known(method: Any) -> bool:  # not that of a subclass, or another one in its place
+            code = getattr(method, "__code__", None)
+            return code is not None and _place(code) in known
+
+        return rewritten(function, lambda _: MaskedUpdates(trees), {UPDATE: _update, KNOWN: is_known})
+
+    def note_loop(self, training: Callable[..., Any], renderers: Collection[str], methods: Methods) -> None:
         """Note whether the loop needs indices, or masks do.
 
         Args:
@@ -44,9 +63,8 @@ class VisibleRows:
             renderers: names by which it may call renderers.
             methods: of its model, by name, that get a render's indices.
         """
-        tree, trees = tree_of(training), {name: tree_of(method) for name, method in methods.items()}
-        known = {name: method for name, method in trees.items() if method is not None}
-        if tree is not None and keeps_masks(tree, renderers, known):
+        tree = tree_of(training)
+        if tree is not None and keeps_masks(tree, renderers, _trees(methods)):
             self._loop = _place(training.__code__)
 
     def is_for_masks(self, caller: CodeType) -> bool:
@@ -70,8 +88,13 @@ class VisibleRows:
         return self._changed[renderer]
 
 
-def _update(mask: Any, *updates: tuple[Any, ...]) -> bool:
-    return update_rows(mask, [Update(*update) for update in updates])
+def _update(mask: Any, *updates: Any) -> bool:
+    return update_rows(mask, updates)
+
+
+def _trees(methods: Methods) -> dict[str, ast.FunctionDef]:
+    """Return the syntax trees of those methods that have one."""
+    return {name: tree for name, method in methods.items() if (tree := tree_of(method)) is not None}
 
 
 def _place(code: CodeType) -> Place:

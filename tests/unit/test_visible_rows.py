@@ -54,6 +54,27 @@ def training(model, views, render):
                 model.add_densification_stats(points, shown, weight)
 """
 
+CALL = """
+import torch
+
+OTHER = torch.tensor([1.0, 2.0, 3.0])
+
+class Model:
+    def __init__(self):
+        self.largest, self.views, self.sums = torch.zeros(3), torch.zeros(3), torch.zeros(3)
+    def add_densification_stats(self, points, visible, wide=None):
+        BODY
+
+def render(radii):
+    return (radii > 0).nonzero()
+
+def training(model, shown, package):
+    radii = package["radii"]
+    model.largest[shown] = torch.max(model.largest[shown], radii[shown])
+    model.add_densification_stats(CALL)
+"""
+ADDED = "self.views[visible] += 1; self.sums[visible] += points[visible]"
+
 FLOATS = st.one_of(st.floats(-1e3, 1e3, width=32), st.sampled_from([math.nan, math.inf]))
 
 
@@ -77,8 +98,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> _Counted:
 def _changed(module: ModuleType) -> SimpleNamespace:
     """Return the functions of a module as `lapgs run` changes them."""
     rows = VisibleRows()
-    rows.note_loop(module.training, {"render"}, {"add_densification_stats": module.Model.add_densification_stats})
-    loop = rows.updating(module.training)
+    methods = {"add_densification_stats": module.Model.add_densification_stats}
+    rows.note_loop(module.training, {"render"}, methods)
+    loop = rows.updating(module.training, methods)
     model = type("Model", (module.Model,), {})
     model.add_densification_stats = rows.updating(module.Model.add_densification_stats)  # type: ignore[attr-defined]
     by_loop = rows.is_for_masks(loop.__code__)
@@ -114,7 +136,56 @@ def test_a_loop_gathers_the_same(
         functions.training(model, views, functions.render)
         states.append(_state(model))
     assert all(map(np.array_equal, *states))
-    assert counted.done == 9 * [True]  # weights, radii, statistics; three views
+    assert counted.done == 6 * [True]  # weights, radii with statistics; three views
+
+
+@pytest.mark.parametrize(
+    ("body", "call", "updates"),
+    [
+        (ADDED, 'package["points"], shown, None', 1),
+        (f"'Say what it does.'; {ADDED}", 'package["points"], shown, radii', 1),
+        (ADDED, 'package["points"], shown', 2),
+        (ADDED, 'package["points"], visible=shown, wide=None', 2),
+        (ADDED, 'package["points"].abs(), shown, None', 2),
+        (ADDED, 'package["points"], shown & shown, None', 2),
+        (ADDED, 'package["points"], package["shown"], None', 2),
+        (ADDED, "*[package[name] for name in ('points', 'shown')], None", 2),
+        ("self.views[visible] += OTHER[visible]", 'package["points"], shown, None', 2),
+        (f"{ADDED}; self.views += 1", 'package["points"], shown, None', 2),
+        ("self.views[visible] += 1; self.sums[wide] += 1", 'package["points"], shown, ~shown', 3),
+        ("pass", 'package["points"], shown, None', 1),
+    ],
+)
+def test_a_method_that_only_updates_is_part_of_the_update_before(
+    load_module: Callable[[str], ModuleType], counted: _Counted, body: str, call: str, updates: int
+) -> None:
+    module = load_module(CALL.replace("BODY", body).replace("CALL", call))
+    shown = torch.tensor([True, False, True])
+    package = {"radii": torch.tensor([3, 2, 1]).int(), "points": torch.tensor([1.0, -2.0, -3.0]), "shown": shown}
+    states = []
+    for functions in (module, _changed(module)):
+        model = functions.Model()
+        for _ in range(2):
+            functions.training(model, shown, package)
+        states.append(_state(model))
+    assert all(map(np.array_equal, *states))
+    assert len(counted.done) == 2 * updates
+    assert all(counted.done)
+
+
+def test_another_method_of_that_name_is_called(load_module: Callable[[str], ModuleType], counted: _Counted) -> None:
+    changed = _changed(load_module(CALL.replace("BODY", ADDED).replace("CALL", "radii, shown, None")))
+    called: list[int] = []
+    own = changed.Model()
+    own.add_densification_stats = lambda *arguments: called.append(len(arguments))
+    derived = type("Derived", (changed.Model,), {"add_densification_stats": lambda *arguments: called.append(4)})()
+    shown, radii = torch.tensor([True, False, True]), torch.tensor([3, 2, 1]).int()
+    for model in (own, derived):
+        changed.training(model, shown, {"radii": radii})
+        assert model.largest.tolist() == [3, 0, 1]
+        assert model.views.tolist() == [0, 0, 0]
+    assert called == [3, 4]
+    assert not counted.done
 
 
 @settings(deadline=None)
@@ -191,6 +262,32 @@ def test_updates_that_depend_on_each_other_or_have_gradients() -> None:
     with torch.no_grad():
         assert update_rows(mask, [Update(rows, False, torch.ones(2, requires_grad=True))])
     assert rows.tolist() == [2, 1]
+
+
+def test_updates_of_the_same_size_are_looked_at_again() -> None:
+    mask, rows, points = torch.tensor([True, False, True]), torch.ones(3, 1), torch.ones(3, 4)
+
+    def done(target: Any = rows, source: Any = points, columns: Any = (0, 2), factor: Any = None) -> bool:
+        return update_rows(mask, [Update(target, False, source, columns, factor), Update(torch.ones(3), False, 1)])
+
+    with torch.no_grad():
+        for _ in range(2):
+            assert done()
+            assert not done(target=torch.ones(3, 1, dtype=torch.float64))
+            assert not done(target=torch.ones(3))
+            assert not done(target=torch.ones(3, 2)[:, :1])
+            assert not done(factor=[1.0])
+            assert not done(source=points.int())
+            assert not done(source=torch.ones(4, 3).T)
+            assert not done(source=[1.0, 1.0, 1.0], columns=None)
+            assert not done(columns=(0, 3))
+            assert not done(factor=rows)
+            assert done(source=1, columns=None)
+            assert not done(source=True, columns=None)
+            assert done(source=torch.nn.Parameter(points))
+    assert not done(source=torch.nn.Parameter(points))
+    updated = 1 + 2 * (1 + 2 * 2**0.5)
+    assert rows[:, 0].tolist() == pytest.approx([updated, 1, updated], rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -149,17 +149,23 @@ def step_rows_triton(
 
 
 def step_tensors_triton(slots: Sequence[AdamSlot], betas: tuple[float, float], eps: float) -> None:
-    """Do `step_torch` for up to `MOST_TENSORS` float32 tensors of any sizes on one CUDA device.
+    """Do `step_torch` for float32 tensors of any sizes on one CUDA device, `MOST_TENSORS` in a launch.
 
     All columns of a tensor have one rate. Each has programs of its own, as in a launch for it alone.
     """
+    for start in range(0, len(slots), MOST_TENSORS):
+        _launch(slots[start : start + MOST_TENSORS], betas, eps)
+
+
+def _launch(slots: Sequence[AdamSlot], betas: tuple[float, float], eps: float) -> None:
     keep1, keep2 = betas
     arguments: list[Tensor | float] = []
-    programs = 0
-    for slot in slots:
-        unbias1, unbias2 = _unbiased(slot.step, betas)
-        n = slot.values.numel()
-        arguments += *slot[:4], slot.rate * unbias1, unbias2, n
+    programs, last = 0, 0.0
+    for values, gradient, mean, square, step, rate, _ in slots:
+        if step != last:  # of all tensors the same, as a rule
+            (unbias1, unbias2), last = _unbiased(step, betas), step
+        n = values.numel()
+        arguments += values, gradient, mean, square, rate * unbias1, unbias2, n
         programs += blocks(n, BLOCK)
     nothing = *slots[0][:4], 0.0, 0.0, 0
     for _ in range(len(slots), MOST_TENSORS):
@@ -169,8 +175,8 @@ def step_tensors_triton(slots: Sequence[AdamSlot], betas: tuple[float, float], e
 
 def _unbiased(step: float, betas: tuple[float, float]) -> tuple[float, float]:
     """Return the factors by which rates have the first moment's bias correction, and roots the second's."""
-    first, second = (1 / (1 - beta**step) for beta in betas)
-    return first, math.sqrt(second)
+    first, second = betas
+    return 1 / (1 - first**step), math.sqrt(1 / (1 - second**step))
 
 
 def step_triton(slots: Sequence[AdamSlot], views: int, gradient: float) -> None:

@@ -18,6 +18,9 @@ from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimize
 from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, AdamSlot
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
+_Stepped = tuple[Tensor, Tensor, dict[str, Any], dict[str, Any]]
+"""A tensor that has a gradient, this gradient, its state and its group of parameters."""
+
 
 class MultiTensorAdam(torch.optim.Adam):
     """Step as `torch.optim.Adam` does, with its groups, state and hooks; results differ by rounding.
@@ -26,6 +29,8 @@ class MultiTensorAdam(torch.optim.Adam):
 
     Where nobody looks on, it does not name its work in profiles, which takes PyTorch as long as some launches.
     """
+
+    _plan: _Plan | None = None  # of the last step; a copy of an optimizer makes its own
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Step all tensors that have a gradient, after `closure`, whose result is returned."""
@@ -44,52 +49,101 @@ class MultiTensorAdam(torch.optim.Adam):
             for values in group["params"]:
                 values.grad = None
 
-    @torch.no_grad()
     def _step(self, closure: Callable[[], Any] | None) -> Any:
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        slots: dict[tuple[Any, ...], list[AdamSlot]] = {}  # of tensors that one launch can step
-        for group in self.param_groups:
-            for values in group["params"]:
-                if values.grad is None:
-                    continue
-                slot = _slot(values, values.grad, self.state[values], group)
-                if slot is not None:
-                    slots.setdefault((*group["betas"], group["eps"], values.device), []).append(slot)
-        for (beta1, beta2, eps, _), together in slots.items():
-            _step_together(together, (beta1, beta2), eps)
+        state = self.state
+        tensors = [
+            (values, gradient, state[values], group)
+            for group in self.param_groups
+            for values in group["params"]
+            if (gradient := values.grad) is not None
+        ]
+        if self._plan is None or not self._plan.fits(tensors):
+            tensors = _left_by_pytorch(tensors)
+            self._plan = _Plan(tensors)
+        self._plan.step(tensors)
         return loss
 
     _watched_step = torch.optim.Optimizer.profile_hook_step(_step)
 
 
-def _slot(values: Tensor, gradient: Tensor, state: dict[str, Any], group: dict[str, Any]) -> AdamSlot | None:
-    """Count a step of a tensor and return its inputs; None if it was stepped in PyTorch's operations."""
-    if not state:  # on the processor, as PyTorch's own counts: a GPU does not have to be asked for it
-        state["step"] = torch.tensor(0.0)
-        state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
-    rate = float(group["lr"])  # some scripts set rates of NumPy's types
-    mean, square = state["exp_avg"], state["exp_avg_sq"]
-    # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
-    if _are_alike(values, gradient, mean, square) and values.numel() > 0 and triton_works(values):
-        count = float(state["step"]) + 1.0
-        state["step"].fill_(count)  # takes a quarter of the time of adding one
-        return AdamSlot(values, gradient, mean, square, count, rate, rate)
-    betas = group["betas"]
-    adam(
-        [values], [gradient], [mean], [square], [], [state["step"]], foreach=False, amsgrad=False, maximize=False,
-        weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=group["eps"],
-    )  # fmt: skip
-    return None
+class _Plan:
+    """Hold how our kernel steps tensors, which is decided again only when one of them looks different.
+
+    Their counts of steps become numbers of one tensor, which a single operation counts. Each remains a tensor on the
+    processor, as PyTorch has it: a script may read, change, replace and save it.
+
+    Args:
+        tensors: those that our kernel can step.
+    """
+
+    def __init__(self, tensors: Sequence[_Stepped]) -> None:
+        counts = torch.tensor([float(state["step"]) for _, _, state, _ in tensors], device="cpu")
+        self._counts = counts.numpy()  # NumPy's operations on a few numbers take a third of the time
+        self._looks = []
+        self._together: dict[tuple[Any, ...], list[int]] = {}  # tensors of a launch, by its settings
+        for index, (values, _, state, group) in enumerate(tensors):
+            state["step"] = counts[index]
+            device, betas, eps = values.get_device(), tuple(group["betas"]), group["eps"]
+            self._looks.append((values.nbytes, device, state["step"], betas, eps))
+            self._together.setdefault((device, betas, eps), []).append(index)
+
+    def fits(self, tensors: Sequence[_Stepped]) -> bool:
+        """Return whether tensors are those of the plan, or others of the same sizes in their places."""
+        if len(tensors) != len(self._looks):
+            return False
+        for (values, gradient, state, group), look in zip(tensors, self._looks, strict=True):
+            nbytes, device, count, betas, eps = look
+            if state.get("step") is not count or group["betas"] != betas or group["eps"] != eps:
+                return False
+            for tensor in (values, gradient, state["exp_avg"], state["exp_avg_sq"]):
+                if tensor.nbytes != nbytes or tensor.get_device() != device or not tensor.is_contiguous():
+                    return False
+        return True
+
+    def step(self, tensors: Sequence[_Stepped]) -> None:
+        """Step tensors that fit."""
+        self._counts += 1.0
+        counts = self._counts.tolist()
+        for (_, betas, eps), together in self._together.items():
+            slots = []
+            for index in together:
+                values, gradient, state, group = tensors[index]
+                rate = float(group["lr"])  # some scripts set rates of NumPy's types
+                moments = state["exp_avg"], state["exp_avg_sq"]
+                slots.append(AdamSlot(values, gradient, *moments, counts[index], rate, rate))
+            _step_in_triton(slots, betas, eps)
 
 
-def _step_together(slots: Sequence[AdamSlot], betas: tuple[float, float], eps: float) -> None:
-    from lapgs_plugin.ops.adam.in_triton import MOST_TENSORS, step_tensors_triton
+def _left_by_pytorch(tensors: Sequence[_Stepped]) -> list[_Stepped]:
+    """Step tensors that our kernel cannot step in PyTorch's operations, and return the others."""
+    left = []
+    for tensor in tensors:
+        values, gradient, state, group = tensor
+        if not state:  # the count on the processor, as PyTorch's own: a GPU does not have to be asked for it
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(values), torch.zeros_like(values)
+        moments = state["exp_avg"], state["exp_avg_sq"]
+        # The kernel does not see shapes. PyTorch's operations say if a fork has pruned a tensor and not its moments.
+        if _are_alike(values, gradient, *moments) and triton_works(values):
+            left.append(tensor)
+            continue
+        betas, rate = group["betas"], float(group["lr"])
+        with torch.no_grad():
+            adam(
+                [values], [gradient], [moments[0]], [moments[1]], [], [state["step"]], foreach=False, amsgrad=False,
+                maximize=False, weight_decay=0.0, beta1=betas[0], beta2=betas[1], lr=rate, eps=group["eps"],
+            )  # fmt: skip
+    return left
 
-    for start in range(0, len(slots), MOST_TENSORS):
-        step_tensors_triton(slots[start : start + MOST_TENSORS], betas, eps)
+
+def _step_in_triton(slots: Sequence[AdamSlot], betas: tuple[float, float], eps: float) -> None:
+    from lapgs_plugin.ops.adam.in_triton import step_tensors_triton
+
+    step_tensors_triton(slots, betas, eps)
 
 
 def _are_alike(first: Tensor, *others: Tensor) -> bool:
@@ -149,7 +203,7 @@ def triton_works(device: torch.device) -> float:
             reference.grad = torch.randn(values.shape, generator=generator).to(device)
             slots.append(AdamSlot(values, reference.grad, mean, square, count, rate, rate))
         optimizer.step()
-        _step_together(slots, BETAS, ADAM_EPS)
+        _step_in_triton(slots, BETAS, ADAM_EPS)
     return largest(
         (values - reference).abs() / (reference.detach() - start).abs().max()
         for (values, _, _), reference, start in zip(states, references, starts, strict=True)

@@ -8,10 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.masked_updates.in_torch import Update, update_rows_torch
+from lapgs_plugin.ops.masked_updates.in_torch import Update, read_columns, update_rows_torch
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 READABLE = torch.float32, torch.int32
+NUMBERS = int, float
+MOST_LOOKS = 256
+"""Most descriptions of updates that are remembered. They have the number of Gaussians, which densification changes."""
+
+_fitting: set[tuple[Any, ...]] = set()  # descriptions by `_looks` of masks and updates that fit
 
 
 def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
@@ -19,18 +24,40 @@ def update_rows(mask: Any, updates: Sequence[Update]) -> bool:
 
     Args:
         mask: (n,) bool, true for the rows to update.
-        updates: of different tensors, none of which another update reads. Nothing is changed if they or the mask are
-            otherwise than described, if gradients would be recorded, or if n is 0.
+        updates: of different tensors, none of which another update reads; or tuples of their fields. Nothing is changed
+            if they or the mask are otherwise than described, if gradients would be recorded, or if n is 0.
     """
-    if not _is_mask(mask) or not all(_fits(update, mask) for update in updates) or not _independent(mask, updates):
+    looks = _looks(mask, updates)
+    if torch.is_grad_enabled() or looks not in _fitting:
+        if not _is_mask(mask) or not all(_fits(Update(*update), mask) for update in updates):
+            return False
+        if len(_fitting) >= MOST_LOOKS:
+            _fitting.clear()
+        _fitting.add(looks)
+    if not _independent(mask, updates):
         return False
-    if triton_works(updates[0].target):  # the others are alike
+    if triton_works(updates[0][0]):  # the others are alike
         from lapgs_plugin.ops.masked_updates.in_triton import update_rows_triton
 
         update_rows_triton(mask, updates)
     else:
         update_rows_torch(mask, updates)
     return True
+
+
+def _looks(mask: Any, updates: Sequence[Update]) -> tuple[Any, ...]:
+    """Return all that decides whether a mask and updates fit, besides gradients and places in memory."""
+    values, columns = [mask], []
+    for target, _, source, read, factor in updates:
+        values += target, source, factor
+        columns.append(read)
+    looks = [
+        (value.shape, value.dtype, value.get_device(), value.is_contiguous())
+        if isinstance(value, Tensor)
+        else value is not None and (type(value), value if isinstance(value, NUMBERS) else None)
+        for value in values
+    ]
+    return (*columns, *looks)
 
 
 def _is_mask(mask: Any) -> bool:
@@ -51,7 +78,7 @@ def _fits(update: Update, mask: Tensor) -> bool:
         and source.dtype is torch.float32
         and source.ndim == target.ndim == 2
         and source.shape[0] == n
-        and 1 <= len(update.read_columns) <= 2
+        and 1 <= len(read_columns(update.columns, source.shape[1])) <= 2
     )
 
 
@@ -72,11 +99,13 @@ def _is_readable(value: Any, other: Tensor) -> bool:
 
 def _independent(mask: Tensor, updates: Sequence[Update]) -> bool:
     """Return whether no update changes what another one, or itself by another row, reads or changes."""
-    changed = {update.target.untyped_storage().data_ptr() for update in updates}
-    read = [value for update in updates for value in (update.source, update.factor) if isinstance(value, Tensor)]
-    return len(changed) == len(updates) and changed.isdisjoint(
-        value.untyped_storage().data_ptr() for value in (mask, *read)
-    )
+    changed, read = [], [mask.untyped_storage().data_ptr()]
+    for target, _, source, _, factor in updates:
+        changed.append(target.untyped_storage().data_ptr())
+        for value in (source, factor):
+            if isinstance(value, Tensor):
+                read.append(value.untyped_storage().data_ptr())
+    return len(set(changed)) == len(changed) and set(changed).isdisjoint(read)
 
 
 @matches_reference("updates of visible rows in several operations instead of one kernel", 0.0)
@@ -99,6 +128,7 @@ def triton_works(device: torch.device) -> float:
             Update(targets[5], False, rows, None, rows),
             Update(targets[6], True, points, (3, None)),
         ]
-        update(mask, updates)
+        update(mask, updates[:1])  # by a kernel of its own
+        update(mask, updates[1:])
         both.append(targets)
     return largest((one - other).abs() for one, other in zip(*both, strict=True))

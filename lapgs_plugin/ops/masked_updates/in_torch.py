@@ -28,20 +28,20 @@ class Update(NamedTuple):
     columns: tuple[int | None, int | None] | None = None
     factor: Any = None
 
-    @property
-    def read_columns(self) -> range:
-        """Columns of the source whose norm is the value."""
-        return range(self.source.shape[1])[slice(*self.columns or ())]
+
+def read_columns(columns: tuple[int | None, int | None], width: int) -> range:
+    """Return the columns of a source of so many whose norm is the value."""
+    return range(width)[slice(*columns)]
 
 
 def update_rows_torch(mask: Tensor, updates: Sequence[Update]) -> None:
     """Do what `update_rows` does for updates that fit, on any device."""
-    for update in updates:
-        target, value = update.target, update.source
-        if update.columns is not None:
+    for target, takes_largest, source, columns, factor in updates:
+        value = source
+        if columns is not None:
             # A copy, as indexing makes: sums of strided rows may be rounded otherwise.
-            value = torch.norm(value[:, slice(*update.columns)].contiguous(), dim=-1, keepdim=True)
-        if update.factor is not None:
-            value = value * update.factor
-        updated = torch.maximum(target, value) if update.takes_largest else target + value
+            value = torch.norm(value[:, slice(*columns)].contiguous(), dim=-1, keepdim=True)
+        if factor is not None:
+            value = value * factor
+        updated = torch.maximum(target, value) if takes_largest else target + value
         target.copy_(torch.where(mask.view_as(target), updated, target))
