@@ -96,6 +96,8 @@ class RasterOutputs:
 
     def with_image(self, image: Tensor) -> Any:
         """Return the outputs with another image (3, h, w) at the key and in the shape of the first."""
+        if image is self._stored:
+            return self.outputs
         if self.rest is not None:
             image = torch.cat([image.expand(*self.rest.shape[:-3], -1, -1, -1), self.rest], -3)
         if self.channels_last:

@@ -96,16 +96,14 @@ class RasterizerWrapper:
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
-            outer, arguments = self.running, (*args, *kwargs.values())
-            key = next((key for v in arguments if (key := view_key(v)) is not None), outer.key)
-            values = tuple(v for v in arguments if isinstance(v, Tensor) and v.ndim == 2)
-            way = original, any(getattr(v, "convert_SHs_python", False) is True for v in arguments)
-            location, by_mask = outer.location, False
+            outer, (key, values, evaluates_sh) = self.running, _told_by((*args, *kwargs.values()))
+            location, by_mask = outer.location, outer.by_mask and self._takes_image_alone
             if outer.way is None:
                 caller = sys._getframe(1)
                 location = f"{_file_name(caller.f_code.co_filename)}:{caller.f_lineno}"
                 by_mask = rows is not None and rows.is_for_masks(caller.f_code)
-            self.running = _RendererCall(way, key, location, (*outer.values, *values), by_mask)
+            way = original, evaluates_sh
+            self.running = _RendererCall(way, key or outer.key, location, (*outer.values, *values), by_mask)
             try:
                 return renderer(*args, **kwargs)
             finally:
@@ -133,6 +131,11 @@ class RasterizerWrapper:
                 make = partial(kind, ours=getattr(ours, name, None))
                 makers += [(holder, make) for holder in profile.rasterizer_holders(rasterizer, name)]
         return [Replacement(*holder, make, consumer) for holder, make in makers]
+
+    @property
+    def _takes_image_alone(self) -> bool:
+        """Whether nothing but the image of a render is used, as in joint training, which renders within a render."""
+        return self._stages.rendering is not None and self._stages.rendering.capture
 
     @contextmanager
     def taking_ours(self) -> Iterator[None]:
@@ -238,6 +241,22 @@ class RasterizerWrapper:
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+def _told_by(arguments: tuple[Any, ...]) -> tuple[str | None, list[Tensor], bool]:
+    """Return what a renderer's arguments say: the key of the view, numbers (n, k), whether to evaluate SH in Python."""
+    key: str | None = None
+    values: list[Tensor] = []
+    evaluates_sh = False
+    for argument in arguments:
+        if isinstance(argument, Tensor):
+            if argument.ndim == 2:
+                values.append(argument)
+        elif key is None and (key := view_key(argument)) is not None:
+            continue  # a view is asked for nothing else: modules take long to say what they do not have
+        elif getattr(argument, "convert_SHs_python", False) is True:
+            evaluates_sh = True
+    return key, values, evaluates_sh
 
 
 @cache
