@@ -8,6 +8,7 @@ three maps, the derivatives of SSIM by the local means; the gradient's kernel fi
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
 from lapgs_plugin.ops.mixed_sizes import Sizes, sizes_on_device
-from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW
 
 COLORS = 3
 BLOCK = 128
@@ -30,6 +31,9 @@ PAIRS = 128
 ZERO_STEP = 4
 """Numbers from one to the next: `launch` wants tensors that begin at multiples of 16 bytes."""
 _zeros: dict[tuple[torch.device, int], list[tuple[Tensor, Tensor]]] = {}  # that are left, by device and stream
+
+_Launch = tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]
+"""Programs, numbers and constants of a launch."""
 
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
@@ -240,9 +244,9 @@ def _gradient_kernel(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """Map (prediction, target, ssim_weight, sizes or None, apart), images (b, 3, h, w), to the loss.
+    """Map (prediction, target, ssim_weight, sizes or None, apart) to the loss; to (loss, L1) if `apart`, without sizes.
 
-    To (loss, L1) if `apart`, without sizes.
+    Images are (3, h, w) or (b, 3, h, w), the prediction's as `_without_gaps` returns it.
     """
 
     @staticmethod
@@ -253,9 +257,7 @@ class _PhotometricLoss(torch.autograd.Function):
             total, l1 = _two_zeros(prediction.device)
         else:
             total = l1 = torch.full((), ssim_weight, device=prediction.device)
-        assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
-        maps = [torch.empty_like(prediction) for _ in range(3)]
-        assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
+        maps = torch.empty_like(prediction), torch.empty_like(prediction), torch.empty_like(prediction)
         own = prediction if sizes is None else sizes_on_device(sizes, prediction.device)
         programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
@@ -335,23 +337,31 @@ class _SsimMap(torch.autograd.Function):
         return gradient, None
 
 
-def _launch_of(
-    prediction: Tensor, target: Tensor, ssim_weight: float, *, mixed: bool = False
-) -> tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]:
+def _launch_of(prediction: Tensor, target: Tensor, ssim_weight: float, *, mixed: bool = False) -> _Launch:
     """Return the programs of a launch, and the numbers and constants that both kernels share.
 
     Weights are those of a pixel and colour, or if sizes are `mixed` of a view and colour.
     """
-    b, _, h, w = prediction.shape
+    strides = prediction.stride(), target.stride()
+    return _launch_of_images(prediction.shape, *strides, target.dtype == torch.uint8, ssim_weight, mixed)
+
+
+@lru_cache(maxsize=256)
+def _launch_of_images(
+    shape: torch.Size, x_strides: tuple[int, ...], y_strides: tuple[int, ...], eight_bit: bool, ssim_weight: float,
+    mixed: bool,
+) -> _Launch:  # fmt: skip
+    # One image (3, h, w) is a batch of one.
+    b, colors, h, w = (1, *shape)[-4:]
+    *x_others, x_column = (0, *x_strides)[-4:]
+    *y_others, y_column = (0, *y_strides)[-4:]
+    assert colors == COLORS, f"{colors} colours"
     strips = blocks(blocks(w, 2) * COLORS, BLOCK)
     rows = rows_of_program(h, strips * b, LEAST_ROWS)
-    per_value = 1 / (b * COLORS if mixed else prediction.numel())
-    scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
+    per_value = 1 / (b * COLORS if mixed else shape.numel())
     weights = (1 - ssim_weight) * per_value, ssim_weight * per_value
-    (*x_strides, x_column), (*y_strides, y_column) = prediction.stride(), target.stride()
-    numbers = h, w, rows, scale, *weights, *x_strides, *y_strides
-    interleaved = prediction.stride(1) == 1
-    constants = {"x_column": x_column, "y_column": y_column, "interleaved": interleaved, "mixed": mixed}
+    numbers = h, w, rows, 1 / 255 if eight_bit else 1.0, *weights, *x_others, *y_others
+    constants = {"x_column": x_column, "y_column": y_column, "interleaved": x_others[1] == 1, "mixed": mixed}
     return (strips, blocks(h, rows), b), numbers, constants
 
 
@@ -359,17 +369,16 @@ def photometric_loss_triton(
     prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None = None
 ) -> Tensor:
     """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
-    image = _without_gaps(as_batch(prediction))
-    options = as_batch(target), ssim_weight, sizes
-    loss: Tensor = _PhotometricLoss.apply(image, *options, False)  # type: ignore[no-untyped-call]  # torch's
+    options = target, ssim_weight, sizes, False
+    loss: Tensor = _PhotometricLoss.apply(_without_gaps(prediction), *options)  # type: ignore[no-untyped-call]  # torch's
     return loss
 
 
 def loss_and_l1_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
     """Do `loss_and_l1` for float32 images on a CUDA device, of any strides."""
-    image = _without_gaps(as_batch(prediction))
-    options = as_batch(target), ssim_weight, None
-    values: tuple[Tensor, Tensor] = _PhotometricLoss.apply(image, *options, True)  # type: ignore[no-untyped-call]
+    # As a batch of one an image would take a node of the backward pass, and more operations.
+    options = target, ssim_weight, None, True
+    values: tuple[Tensor, Tensor] = _PhotometricLoss.apply(_without_gaps(prediction), *options)  # type: ignore[no-untyped-call]
     return values
 
 
@@ -381,4 +390,4 @@ def ssim_map_triton(prediction: Tensor, target: Tensor) -> Tensor:
 
 def _without_gaps(image: Tensor) -> Tensor:
     """Return an image whose maps and gradient can have its strides."""
-    return image if image.is_contiguous() or image.movedim(1, -1).is_contiguous() else image.contiguous()
+    return image if image.is_contiguous() or image.movedim(-3, -1).is_contiguous() else image.contiguous()
