@@ -113,7 +113,7 @@ def upsample_add_triton(
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """Do `upsample` for a float32 image on a CUDA device, with any strides."""
+    """Do `upsample` for an image on a CUDA device, with any strides: float32, or float16 without gradient."""
     if not are_differentiated(coarse):
         return _upsampled(pyramid.grid, size, coarse)
     options = pyramid.grid, size, None
@@ -155,7 +155,8 @@ def _upsampled(
     sizes: Sizes | None = None,
 ) -> Tensor:  # fmt: skip
     """Return Up(coarse) + fine of this size, without a gradient."""
-    out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
+    shape = *coarse.shape[:-2], *size
+    out = coarse.new_empty(shape, dtype=torch.float32) if fine is None else torch.empty_like(fine)
     if sizes is None:
         _filter(coarse, grid, size, out, fine, clamps=clamps)
         return out
@@ -176,21 +177,23 @@ def _filter(
         transposed: the sums are those of the gradient.
         only: number of the image to filter, in its top left part; None filters all. Taps depend on the size.
     """
-    tensors = (source, out if added is None else added, out)
-    images = [image if image.ndim == 4 else image[None] for image in tensors]  # (b, c, ..., ...) each
+    images = (source, out if added is None else added, out)
+    # One image (c, h, w) is a batch of one.
+    b, planes, _, _ = (1, *out.shape)[-4:]
+    strides = [(0, *image.stride())[-4:] for image in images]
     taps = _up_transposed if transposed else _up
     rows, columns = (taps(grid, side, source.device) for side in size)
-    b, planes = (images[2].shape[0] if only is None else 1), images[2].shape[1]
+    b = b if only is None else 1
     height, width = len(rows.first), len(columns.first)
     strips = blocks(planes * width, BLOCK)
     count = rows_of_program(height, strips * b, LEAST_ROWS)
-    source_column, added_column, out_column = (image.stride(3) for image in images)
+    source_column, added_column, out_column = (stride[3] for stride in strides)
     launch(
         _kernel, (strips, blocks(height, count), b),
         *images, *rows, *columns, height, width, count, only or 0,
-        *(stride for image in images for stride in image.stride()[:3]),
+        *strides[0][:3], *strides[1][:3], *strides[2][:3],
         source_column=source_column, added_column=added_column, out_column=out_column,
-        adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
+        adds=added is not None, clamps=clamps, planes=planes, interleaved=strides[2][1] == 1,
         taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
     )  # fmt: skip
 
