@@ -91,6 +91,8 @@ class RasterOutputs:
         items = () if self.key is None else _items(self.outputs)
         others = [self.rest, *(value for key, value in items if key != self.key)]
         others = [value for value in others if isinstance(value, Tensor) and value.requires_grad]
+        if not others:
+            return []
         size = tuple(self.image.shape[1:])
         return [v for v in others if size in (tuple(v.shape[-2:]), tuple(v.shape[-3:-1]))]
 
