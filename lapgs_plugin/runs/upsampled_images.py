@@ -44,7 +44,6 @@ class UpsampledImages:
         """Start copying a view's stored image to the device; see `ImageStore.prefetch`."""
         self.store.prefetch(name)
 
-    @torch.no_grad()
     def get(self, *names: str) -> Tensor:
         """Return Up of an image, or of several, as a new tensor; see `ImageStore.get`."""
         sizes = [self._sizes[name] for name in names]

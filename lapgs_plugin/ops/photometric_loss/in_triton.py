@@ -41,7 +41,7 @@ SSIM_CONSTANTS: dict[str, Any] = {"c1": SSIM_C1, "c2": SSIM_C2}
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.
 OF_ANY_VALUE = (
-    *("height", "width", "rows", "x_image", "x_plane", "x_row", "y_image", "y_plane", "y_row"),
+    *("height", "width", "rows", "map_size", "x_image", "x_plane", "x_row", "y_image", "y_plane", "y_row"),
     *("scale", "l1_weight", "ssim_weight"),
 )
 
@@ -113,9 +113,8 @@ def _add(
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
-    x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
-    l1: tl.tensor, values: tl.tensor, sizes: tl.tensor,
-    height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
+    x: tl.tensor, y: tl.tensor, maps: tl.tensor, total: tl.tensor, l1: tl.tensor, values: tl.tensor, sizes: tl.tensor,
+    height: int, width: int, rows: int, map_size: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, mapped: tl.constexpr,
     apart: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr, window: tl.constexpr, radius: tl.constexpr,
@@ -125,7 +124,7 @@ def _loss_kernel(
 
     Args:
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
-        by_mean, by_square, by_product: with the strides of x.
+        maps: these three, each with the strides of x, and `map_size` numbers from one to the next.
         total: the loss, where lambda is there before, or 0 if `apart` is 1; unused if `mapped`.
         l1: L1 alone; unused unless `apart` is 1, for sizes that are not `mixed`.
         values: SSIM itself, with the strides of x; unused unless `mapped`.
@@ -178,9 +177,9 @@ def _loss_kernel(
             ssim, slope, curvature, share = _ssim(mean, mean_y, squares, products, c1, c2)
             loss -= tl.where(inside, ssim_weight * (ssim - apart), 0.0)
             here = out + (row - radius).to(tl.int64) * x_row
-            tl.store(by_mean + here, slope, inside)
-            tl.store(by_square + here, curvature, inside)
-            tl.store(by_product + here, share, inside)
+            tl.store(maps + here, slope, inside)
+            tl.store(maps + map_size + here, curvature, inside)
+            tl.store(maps + map_size + map_size + here, share, inside)
             if mapped:
                 tl.store(values + here, ssim, inside)
         row += 1
@@ -190,14 +189,14 @@ def _loss_kernel(
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _gradient_kernel(
-    x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor,
-    by_loss: tl.tensor, gradient: tl.tensor, sizes: tl.tensor,
-    height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
+    x: tl.tensor, y: tl.tensor, maps: tl.tensor, by_loss: tl.tensor, gradient: tl.tensor, sizes: tl.tensor,
+    height: int, width: int, rows: int, map_size: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the gradient by x, with the strides of x; arguments as `_loss_kernel` takes them."""
+    by_square, by_product = maps + map_size, maps + map_size + map_size
     image = tl.program_id(2).to(tl.int64)
     width, height, l1_weight, ssim_weight = _own_size(sizes + 2 * image, width, height, l1_weight, ssim_weight, mixed)
     column, color = _place(width, colors, interleaved, block, 2 * radius)
@@ -220,7 +219,7 @@ def _gradient_kernel(
         for near in tl.static_range(2 * radius + 2):
             there = (column + (near - radius)).to(tl.uint32) < limit.to(tl.uint32)
             here = at_x + row.to(tl.int64) * x_row + (near - radius) * x_column
-            mean, square = tl.load(by_mean + here, there, 0.0), tl.load(by_square + here, there, 0.0)
+            mean, square = tl.load(maps + here, there, 0.0), tl.load(by_square + here, there, 0.0)
             product = tl.load(by_product + here, there, 0.0)
             if near <= 2 * radius:
                 mean0 += window[near] * mean
@@ -257,14 +256,14 @@ class _PhotometricLoss(torch.autograd.Function):
             total, l1 = _two_zeros(prediction.device)
         else:
             total = l1 = torch.full((), ssim_weight, device=prediction.device)
-        maps = torch.empty_like(prediction), torch.empty_like(prediction), torch.empty_like(prediction)
+        maps = _empty_maps(prediction)
         own = prediction if sizes is None else sizes_on_device(sizes, prediction.device)
         programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, total, l1, total, own, *numbers, **constants,
+            _loss_kernel, programs, prediction, target, maps, total, l1, total, own, *numbers, **constants,
             **SSIM_CONSTANTS, mapped=False, apart=int(apart), **CONSTANTS,
         )  # fmt: skip
-        ctx.save_for_backward(prediction, target, *maps)
+        ctx.save_for_backward(prediction, target, maps)
         ctx.ssim_weight, ctx.own = ssim_weight, None if sizes is None else own
         ctx.set_materialize_grads(False)
         return (total, l1) if apart else total
@@ -274,7 +273,7 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(
         ctx: Any, by_loss: Tensor | None, by_l1: Tensor | None = None
     ) -> tuple[Tensor | None, None, None, None, None]:
-        prediction, target, *maps = ctx.saved_tensors
+        prediction, target, maps = ctx.saved_tensors
         by_distance = None
         if by_l1 is not None:  # seldom: loops of the family only log it
             by_distance = by_l1 / prediction.numel() * (prediction - target).sign()
@@ -284,10 +283,15 @@ class _PhotometricLoss(torch.autograd.Function):
         gradient = torch.zeros_like(prediction) if mixed else torch.empty_like(prediction)
         programs, numbers, constants = _launch_of(prediction, target, ctx.ssim_weight, mixed=mixed)
         launch(
-            _gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, ctx.own if mixed else gradient,
+            _gradient_kernel, programs, prediction, target, maps, by_loss, gradient, ctx.own if mixed else gradient,
             *numbers, **constants, **CONSTANTS,
         )  # fmt: skip
         return gradient if by_distance is None else gradient + by_distance, None, None, None, None
+
+
+def _empty_maps(prediction: Tensor) -> Tensor:
+    """Return room for the three maps that the loss's kernel writes."""
+    return prediction.new_empty(3 * prediction.numel())
 
 
 def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
@@ -296,12 +300,9 @@ def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
     pairs = _zeros.setdefault((device, stream), [])
     if not pairs:
         with torch.inference_mode(False):
-            block = torch.zeros(2 * PAIRS * ZERO_STEP, device=device).untyped_storage()
-            # No views: scripts may change a loss in place.
-            scalars = [
-                torch.empty(0, device=device).set_(block, ZERO_STEP * i, ())  # type: ignore[call-overload]
-                for i in range(2 * PAIRS)
-            ]
+            block = torch.zeros(2 * PAIRS, ZERO_STEP, device=device)
+            # Their data, which are no views: scripts may change a loss in place.
+            scalars = [scalar.data for scalar in block[:, 0].unbind()]
         pairs += zip(scalars[::2], scalars[1::2], strict=True)
     return pairs.pop()
 
@@ -311,27 +312,26 @@ class _SsimMap(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor) -> Tensor:
-        values, *maps = (torch.empty_like(prediction) for _ in range(4))
+        values, maps = torch.empty_like(prediction), _empty_maps(prediction)
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, values, values, values, values, *numbers, **constants,
+            _loss_kernel, programs, prediction, target, maps, values, values, values, values, *numbers, **constants,
             **SSIM_CONSTANTS, mapped=True, apart=0, **CONSTANTS,
         )  # fmt: skip
-        ctx.save_for_backward(prediction, target, *maps)
+        ctx.save_for_backward(prediction, target, maps)
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_values: Tensor) -> tuple[Tensor, None]:
-        prediction, target, *maps = ctx.saved_tensors
+        prediction, target, maps = ctx.saved_tensors
         gradient = torch.empty_like(prediction)
         # The kernel takes the derivative of a loss that has -1 / numel of each value, times a factor.
-        by_values = by_values.contiguous()
-        maps = [by_values * each for each in maps]
+        maps = (maps.view(3, -1) * by_values.reshape(-1)).view(-1)
         factor = prediction.new_full((), -prediction.numel())
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _gradient_kernel, programs, prediction, target, *maps, factor, gradient, gradient, *numbers, **constants,
+            _gradient_kernel, programs, prediction, target, maps, factor, gradient, gradient, *numbers, **constants,
             **CONSTANTS,
         )  # fmt: skip
         return gradient, None
@@ -360,7 +360,7 @@ def _launch_of_images(
     rows = rows_of_program(h, strips * b, LEAST_ROWS)
     per_value = 1 / (b * COLORS if mixed else shape.numel())
     weights = (1 - ssim_weight) * per_value, ssim_weight * per_value
-    numbers = h, w, rows, 1 / 255 if eight_bit else 1.0, *weights, *x_others, *y_others
+    numbers = h, w, rows, shape.numel(), 1 / 255 if eight_bit else 1.0, *weights, *x_others, *y_others
     constants = {"x_column": x_column, "y_column": y_column, "interleaved": x_others[1] == 1, "mixed": mixed}
     return (strips, blocks(h, rows), b), numbers, constants
 
