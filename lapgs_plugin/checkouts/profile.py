@@ -14,7 +14,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from lapgs_plugin.checkouts.rasterizer_uses import RasterizerUse
@@ -199,7 +199,7 @@ class Profile:
                 f"renders a view; {OTHERWISE}"
             )
         first, second, *others = _parameters(renderer)
-        named = {name: background for name in others if BACKGROUND_WORDS & set(name.split("_"))}
+        named = {name: background for name in others if BACKGROUND_WORDS & _words(name)}
         named |= {name: False for name in others if self._is_training_flag(name, values)}
         named |= {first: view, second: model} | {name: value for name, value in options.items() if name in others}
         # Looked up at each call: it may be replaced meanwhile.
@@ -222,9 +222,10 @@ class Profile:
     def _is_training_flag(self, name: str, values: Mapping[str, Any]) -> bool:
         """Return whether a parameter of the loop's renderer says that the image is trained on."""
         assert self.loop_renderer is not None, "asked of its parameters"
+        if not TRAINING_WORDS & _words(name):
+            return False
         default = _parameters(self.loop_renderer)[name].default
-        on = default if isinstance(default, bool) else self.loop_argument(name, values)
-        return isinstance(on, bool) and bool(TRAINING_WORDS & set(name.split("_")))
+        return isinstance(default if isinstance(default, bool) else self.loop_argument(name, values), bool)
 
     @property
     def _training_place(self) -> str:
@@ -325,7 +326,7 @@ class Profile:
         return function(**arguments)
 
     def _evaluated(self, expression: ast.expr, values: Mapping[str, Any]) -> Any:
-        code = compile(ast.Expression(expression), str(self.script.path), "eval", dont_inherit=True)
+        code = _compiled(expression, str(self.script.path))
         try:
             return eval(code, vars(self.script.module), dict(values))
         except NameError:
@@ -376,6 +377,18 @@ def _records_no_gradients(node: ast.AST) -> bool:
     return any(called_name(call) == "no_grad" for call in calls)
 
 
-@lru_cache(maxsize=64)  # asked for in every iteration of joint training
+# Asked for in every iteration of joint training:
+@lru_cache(maxsize=256)
+def _words(name: str) -> frozenset[str]:
+    """Return the words that a name consists of."""
+    return frozenset(name.split("_"))
+
+
+@lru_cache(maxsize=64)
+def _compiled(expression: ast.expr, path: str) -> CodeType:
+    return compile(ast.Expression(expression), path, "eval", dont_inherit=True)
+
+
+@lru_cache(maxsize=64)
 def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
     return inspect.signature(function).parameters

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import (
@@ -81,6 +82,7 @@ class ActiveStage(RunningStage):
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         self.returned: Any = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
+        self._asked: _Finiteness | None = None  # about the positions after an earlier iteration
 
     @contextmanager
     def entered(self) -> Iterator[None]:
@@ -147,7 +149,7 @@ class ActiveStage(RunningStage):
         self.record.count(iteration, count)
         if iteration % self.record.history_every == 0:
             self.record.write_history(iteration, {"elapsed": self.record.elapsed_in_run(), "num_gaussians": count})
-            self._note_divergence(gaussians, iteration - 1)
+            self._ask_for_divergence(gaussians, iteration - 1)
 
     def densified(self, gaussians: Any) -> None:
         """Call hooks after density control.
@@ -210,6 +212,7 @@ class ActiveStage(RunningStage):
             LapgsError: training left nothing to archive, or NaN or inf.
         """
         gaussians, self.gaussians = self.gaussians, None  # an error from here on does not archive it again
+        self._note_divergence()
         self._step_appearance()
         self.record.stop(self._views.images.bytes_on_device)
         self._context.hooks.on_stage_end(self.stage)
@@ -281,15 +284,22 @@ class ActiveStage(RunningStage):
         if self._options.prune and self._prune_at is None:
             logger.warning("%s", unpruned_line(self._options.prune, self.stage.level))
 
-    def _note_divergence(self, gaussians: Any, iteration: int) -> None:
-        """Warn once if positions are not finite. Training goes on: some checkouts prune such Gaussians."""
-        if self._diverged_at is not None or bool(torch.isfinite(gaussians._xyz.detach()).all()):
+    def _ask_for_divergence(self, gaussians: Any, iteration: int) -> None:
+        """Ask the device whether positions are finite; `_note_divergence` reads its answer when it is there."""
+        self._note_divergence()
+        if self._diverged_at is None:
+            self._asked = _Finiteness(gaussians._xyz, iteration)
+
+    def _note_divergence(self) -> None:
+        """Warn once if positions were not finite. Training goes on: some checkouts prune such Gaussians."""
+        asked, self._asked = self._asked, None
+        if asked is None or asked.read():
             return
-        self._diverged_at = iteration
+        self._diverged_at = asked.iteration
         logger.warning(
             "level %d has positions of NaN or inf after iteration %d; while it has, it cannot be archived",
             self.stage.level,
-            iteration,
+            asked.iteration,
         )
 
     def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
@@ -380,3 +390,28 @@ class ActiveStage(RunningStage):
             with self.record.overhead.timed("cache"):
                 predictions = self._views.predict(gaussians)
         return StageResult(field, predictions, carried, moments)
+
+
+class _Finiteness:
+    """Ask a device whether positions are finite, without waiting for it: the loop runs ahead of it.
+
+    Args:
+        positions: (n, 3).
+        iteration: after which they are these.
+
+    Attributes:
+        iteration: as given.
+    """
+
+    def __init__(self, positions: Tensor, iteration: int) -> None:
+        self.iteration = iteration
+        self._zero = (0 * positions.detach()).sum().to("cpu", non_blocking=True)  # NaN if one is not finite
+        self._copied = torch.cuda.Event() if positions.is_cuda else None  # type: ignore[no-untyped-call]  # torch's
+        if self._copied is not None:
+            self._copied.record(torch.cuda.current_stream(positions.device))
+
+    def read(self) -> bool:
+        """Return whether they are, once the device has arrived there."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return float(self._zero) == 0.0

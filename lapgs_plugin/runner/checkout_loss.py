@@ -74,14 +74,20 @@ def _losses(l1: Any, ssim: Any, batched: bool, image: Any, target: Any, weight: 
         image, target: (3, h, w), or else None is returned.
         weight: lambda.
     """
-    images = _images({"image": image, "target": target})
-    if images is None or images[0] is not image or image.ndim != 3 or type(weight) is not float or not 0 <= weight <= 1:
+    if not (_are_image_and_target(image, target) and type(weight) is float and 0 <= weight <= 1):
         return None
     device, of_ssim = image.device, _batch_difference if batched else _loss_difference
     if not (_has_one_kernel(image) and _agrees(_l1_difference, l1, device) and _agrees(of_ssim, ssim, device)):
         return None
     loss, distance = photometric_loss.loss_and_l1(image, target, weight)
     return distance, loss
+
+
+def _are_image_and_target(image: Any, target: Any) -> bool:
+    """Return whether values are images (3, h, w) that our kernels suit, without gradients by the target."""
+    if not (isinstance(image, Tensor) and isinstance(target, Tensor)) or target.requires_grad or image.ndim != 3:
+        return False
+    return _fits(image) and _are_alike(image, target)
 
 
 @cache
@@ -98,8 +104,11 @@ def _images(arguments: dict[str, Any]) -> tuple[Tensor, Tensor] | None:
     if not all(isinstance(image, Tensor) and _fits(image) for image in images):
         return None
     first, second = sorted(images, key=lambda image: not image.requires_grad)
-    alike = first.shape == second.shape and first.device == second.device
-    return (first, second) if alike and not second.requires_grad else None
+    return (first, second) if _are_alike(first, second) and not second.requires_grad else None
+
+
+def _are_alike(image: Tensor, other: Tensor) -> bool:
+    return image.shape == other.shape and image.device == other.device and image.dtype == other.dtype
 
 
 def _fits(image: Tensor) -> bool:

@@ -15,6 +15,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.ops.adam import ADAM_EPS
 from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.runner.context import FinishedStage, TrainingRun
+from lapgs_plugin.runner.stage_model import fuse_rotations
 from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.stages.joint import RenderedPredictions
@@ -55,6 +56,8 @@ class JointModels:
     def _load(self, finished: FinishedStage) -> _JointField:
         adapter, call, stage = self._context.adapter, finished.call, finished.stage
         gaussians = adapter.model_of(call, self._run.archive.field(stage.level).to(self._run.device))
+        if self._run.device.type == "cuda":
+            fuse_rotations(gaussians)
         rendering = StageRendering(stage.signed, self._run.color_path, self._views.cameras, capture=True)
         return _JointField(finished, gaussians, rendering)
 

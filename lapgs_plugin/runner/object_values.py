@@ -91,11 +91,15 @@ class RasterOutputs:
         items = () if self.key is None else _items(self.outputs)
         others = [self.rest, *(value for key, value in items if key != self.key)]
         others = [value for value in others if isinstance(value, Tensor) and value.requires_grad]
+        if not others:
+            return []
         size = tuple(self.image.shape[1:])
         return [v for v in others if size in (tuple(v.shape[-2:]), tuple(v.shape[-3:-1]))]
 
     def with_image(self, image: Tensor) -> Any:
         """Return the outputs with another image (3, h, w) at the key and in the shape of the first."""
+        if image is self._stored:
+            return self.outputs
         if self.rest is not None:
             image = torch.cat([image.expand(*self.rest.shape[:-3], -1, -1, -1), self.rest], -3)
         if self.channels_last:

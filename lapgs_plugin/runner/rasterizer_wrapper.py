@@ -24,12 +24,13 @@ from lapgs_plugin.checkouts.attachment import Replacement
 from lapgs_plugin.checkouts.level_views import view_key
 from lapgs_plugin.checkouts.profile import Profile
 from lapgs_plugin.checkouts.rewriting import rewritten
-from lapgs_plugin.checkouts.screen_points import POINTS, ScreenPoints
+from lapgs_plugin.checkouts.screen_points import POINTS, SETTINGS_ZEROS, ScreenPoints, SettingsZeros
 from lapgs_plugin.checkouts.whole_sh import SH, WHOLE, WholeSh, joined_attributes
 from lapgs_plugin.family.binding import Rasterizer
 from lapgs_plugin.family.call import ShParts
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
+from lapgs_plugin.runner.stage_rendering import KeptZeros
 from lapgs_plugin.runner.visible_rows import VisibleRows
 
 
@@ -80,7 +81,7 @@ class RasterizerWrapper:
         self._ours, self.takes_ours = ours or {}, False
         self.running = _RendererCall()
         self._zeros: Tensor | None = None
-        self._points: tuple[list[Any], Tensor, int] | None = None  # how they were asked for, and their version
+        self._kept: dict[str, KeptZeros] = {}  # outside of stages
         self._take_parts: dict[bool, bool] = {}  # by whether ours renders: whether the rasterizers take `ShParts`
         self._parts: dict[type, tuple[str, str] | None] = {}
         # Ways of rendering in which SH were passed on to a rasterizer, kept for the whole run: the dry run and the
@@ -92,20 +93,19 @@ class RasterizerWrapper:
         rows = self.rows
         renderer = rewritten(original, WholeSh, {SH: self._sh})
         renderer = rewritten(renderer, ScreenPoints, {POINTS: self._screen_points})
+        renderer = rewritten(renderer, SettingsZeros, {SETTINGS_ZEROS: self._settings_zeros})
         renderer = renderer if rows is None else rows.in_renderer(renderer, lambda: self.running.by_mask)
 
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
-            outer, arguments = self.running, (*args, *kwargs.values())
-            key = next((key for v in arguments if (key := view_key(v)) is not None), outer.key)
-            values = tuple(v for v in arguments if isinstance(v, Tensor) and v.ndim == 2)
-            way = original, any(getattr(v, "convert_SHs_python", False) is True for v in arguments)
-            location, by_mask = outer.location, False
+            outer, (key, values, evaluates_sh) = self.running, _told_by((*args, *kwargs.values()))
+            location, by_mask = outer.location, outer.by_mask and self._takes_image_alone
             if outer.way is None:
                 caller = sys._getframe(1)
                 location = f"{_file_name(caller.f_code.co_filename)}:{caller.f_lineno}"
                 by_mask = rows is not None and rows.is_for_masks(caller.f_code)
-            self.running = _RendererCall(way, key, location, (*outer.values, *values), by_mask)
+            way = original, evaluates_sh
+            self.running = _RendererCall(way, key or outer.key, location, (*outer.values, *values), by_mask)
             try:
                 return renderer(*args, **kwargs)
             finally:
@@ -133,6 +133,16 @@ class RasterizerWrapper:
                 make = partial(kind, ours=getattr(ours, name, None))
                 makers += [(holder, make) for holder in profile.rasterizer_holders(rasterizer, name)]
         return [Replacement(*holder, make, consumer) for holder, make in makers]
+
+    @property
+    def _renders_by_ours(self) -> bool:
+        """Whether our rasterizer is called, be it in place of the checkout's or as the one that it imports."""
+        return self._take_parts.get(self.takes_ours, False)
+
+    @property
+    def _takes_image_alone(self) -> bool:
+        """Whether nothing but the image of a render is used, as in joint training, which renders within a render."""
+        return self._stages.rendering is not None and self._stages.rendering.capture
 
     @contextmanager
     def taking_ours(self) -> Iterator[None]:
@@ -211,7 +221,7 @@ class RasterizerWrapper:
         if kind not in self._parts:
             self._parts[kind] = joined_attributes(kind)
         names = self._parts[kind]
-        if names is None or rendering is None or not self._take_parts.get(self.takes_ours) or not rendering.takes_parts:
+        if names is None or rendering is None or not self._renders_by_ours or not rendering.takes_parts:
             return getattr(model, WHOLE)
         return ShParts(getattr(model, names[0]), getattr(model, names[1]))
 
@@ -226,18 +236,56 @@ class RasterizerWrapper:
         """
         if not torch.is_grad_enabled() or torch.is_inference_mode_enabled():
             return make(*args, **kwargs) + 0
-        like = [(a.shape, a.dtype, a.device) if isinstance(a, Tensor) else a for a in args]
-        asked = [make, like, kwargs]
-        if self._points is None or self._points[0] != asked or self._points[1]._version != self._points[2]:
+        return self._kept_zeros(POINTS, make, args, kwargs).detach().requires_grad_()
+
+    def _settings_zeros(self, make: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
+        """Return the zeros of a setting, the same ones in each iteration if ours gets them, which writes to none.
+
+        Args:
+            make: PyTorch's function of zeros.
+            args, kwargs: of it.
+        """
+        if not self._renders_by_ours or torch.is_inference_mode_enabled():
+            return make(*args, **kwargs)
+        return self._kept_zeros(SETTINGS_ZEROS, make, args, kwargs)
+
+    def _kept_zeros(
+        self, name: str, make: Callable[..., Tensor], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> Tensor:
+        """Return the zeros of the last render of this stage, or new ones if others are asked for or they were written.
+
+        Each field of joint training has a rendering of its own, and as many Gaussians in each iteration.
+        """
+        rendering = self._stages.rendering
+        kept = self._kept if rendering is None else rendering.kept
+        asked = [make, [(a.shape, a.dtype, a.device) if isinstance(a, Tensor) else a for a in args], kwargs]
+        last = kept.get(name)
+        if last is None or last.asked != asked or last.zeros._version != last.version:
             zeros = make(*args, **kwargs).detach()
-            self._points = asked, zeros, zeros._version
-        return self._points[1].detach().requires_grad_()
+            last = kept[name] = KeptZeros(asked, zeros, zeros._version)
+        return last.zeros
 
     def _zero_background(self, like: Tensor) -> Tensor:
         """Return (3,) zeros on the device of a background, the same ones in every call."""
         if self._zeros is None or self._zeros.device != like.device:
             self._zeros = torch.zeros_like(like)
         return self._zeros
+
+
+def _told_by(arguments: tuple[Any, ...]) -> tuple[str | None, list[Tensor], bool]:
+    """Return what a renderer's arguments say: the key of the view, numbers (n, k), whether to evaluate SH in Python."""
+    key: str | None = None
+    values: list[Tensor] = []
+    evaluates_sh = False
+    for argument in arguments:
+        if isinstance(argument, Tensor):
+            if argument.ndim == 2:
+                values.append(argument)
+        elif key is None and (key := view_key(argument)) is not None:
+            continue  # a view is asked for nothing else: modules take long to say what they do not have
+        elif getattr(argument, "convert_SHs_python", False) is True:
+            evaluates_sh = True
+    return key, values, evaluates_sh
 
 
 @cache

@@ -49,6 +49,21 @@ class Captured:
         return RasterOutputs.of(self.rasterizer(**{**self.inputs, **others}), size_of(self.settings)).image
 
 
+@dataclass(frozen=True)
+class KeptZeros:
+    """Hold zeros that a renderer makes in each call.
+
+    Attributes:
+        asked: the function that makes them, and its arguments.
+        zeros: on the device.
+        version: PyTorch's, by which it is seen whether they were written.
+    """
+
+    asked: list[Any]
+    zeros: Tensor
+    version: int
+
+
 @dataclass
 class StageRendering:
     """Describe to the rasterizer's wrapper how a stage is rendered.
@@ -68,6 +83,7 @@ class StageRendering:
         on_call: called when gradients are recorded with key, composed image, rasterizer, its inputs and its settings;
             returns the image to use instead.
         capture: keep the last call in `captured`, its image without the appearance of a photo.
+        kept: zeros of the last render, by what they are for.
     """
 
     signed: bool
@@ -82,6 +98,7 @@ class StageRendering:
     on_call: OnCall | None = None
     capture: bool = False
     captured: Captured | None = field(default=None, repr=False)
+    kept: dict[str, KeptZeros] = field(default_factory=dict, repr=False)
     _told: bool = field(default=False, repr=False)
     _by_matrix: dict[bytes, set[str]] = field(default_factory=dict, repr=False)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lapgs_plugin.hierarchy.pyramid import Pyramid, require_half
 from lapgs_plugin.ops.mixed_sizes import if_mixed, largest_size
+from lapgs_plugin.ops.photometric_loss import decoded
 from lapgs_plugin.ops.upsample import upsample, upsample_add
 from lapgs_plugin.runs.image_store import ImageStore
 
@@ -43,12 +44,12 @@ class UpsampledImages:
         """Start copying a view's stored image to the device; see `ImageStore.prefetch`."""
         self.store.prefetch(name)
 
-    @torch.no_grad()
     def get(self, *names: str) -> Tensor:
         """Return Up of an image, or of several, as a new tensor; see `ImageStore.get`."""
         sizes = [self._sizes[name] for name in names]
         width, height = largest_size(sizes)
-        return upsample(self.pyramid, self.store.get(*names), (height, width), if_mixed(sizes))
+        coarse = decoded(self.store.get_stored(*names))
+        return upsample(self.pyramid, coarse, (height, width), if_mixed(sizes))
 
     def adder(self, names: Sequence[str]) -> Callable[[Tensor], Tensor]:
         """Return a function that adds Up of the images of some views to (c, h, w), or to (b, c, h, w).

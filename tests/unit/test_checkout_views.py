@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from multiprocessing.pool import ThreadPool
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.stage_rendering import GREY, StageRendering
+from lapgs_plugin.runner.visible_rows import VisibleRows
 
 WIDTH, HEIGHT = 8, 6
 
@@ -273,6 +275,43 @@ def test_a_prediction_is_read_once_and_not_for_a_viewer_at_the_place_of_a_photo(
     assert function(torch.full((2, 3), 0.5), settings(3, 4, torch.ones(3), matrix))[1].unique().tolist() == [0.75]
     assert read == [images.key(camera)]
     assert function(torch.zeros(2, 3), settings(6, 8, torch.ones(3), matrix))[1].unique().tolist() == [GREY]
+
+
+LOOP = """
+import torch
+
+def render(radii, also=None):
+    if also is not None:
+        also()
+    return {"visibility_filter": (radii > 0).nonzero()}
+
+def training(radii, total, also):
+    package = render(radii, also)
+    shown = package["visibility_filter"]
+    total[shown] += 1
+    return total
+"""
+
+
+@pytest.mark.parametrize("capture", [True, False])
+def test_renders_within_a_render_list_no_gaussians_where_only_their_image_is_used(
+    capture: bool, load_module: Callable[[str], ModuleType]
+) -> None:
+    """As those of joint training; a renderer that calls another one may use its indices."""
+    module, rows, stages, shown = load_module(LOOP), VisibleRows(), Stages(), []
+    rows.note_loop(module.training, {"render"}, {})
+    wrapper = RasterizerWrapper(stages, rows=rows)
+    module.render = render = wrapper.renderer(module.render)  # type: ignore[attr-defined]
+    radii = torch.tensor([0, 2, 0, 1])
+
+    def again() -> None:
+        with stages.rendering_as(StageRendering(False, ColorPath.NATIVE, {}, capture=capture)):
+            shown.append(render(radii)["visibility_filter"])
+
+    assert module.training(radii, torch.zeros(4), again).tolist() == [0, 1, 0, 1]
+    assert shown[0].tolist() == ([False, True, False, True] if capture else [[1], [3]])
+    again()
+    assert shown[1].tolist() == [[1], [3]], "outside of the loop"
 
 
 class WithProjection(NamedTuple):

@@ -1,4 +1,4 @@
-"""The tensor by which a renderer asks for gradients of projected centres, made as a leaf of kept zeros."""
+"""Zeros that renderers make in each call: to ask for gradients of projected centres, and as settings."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_plugin.checkouts.screen_points import ScreenPoints
+from lapgs_plugin.checkouts.screen_points import ScreenPoints, SettingsZeros
+from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
 from lapgs_plugin.runner.running_stage import Stages
+from lapgs_plugin.runner.stage_rendering import StageRendering
 
 RENDERER = """
 import torch
@@ -76,6 +78,20 @@ def test_zeros_that_were_written_are_made_again(load_module: Callable[[str], Mod
             points.add_(1)
 
 
+def test_fields_that_are_rendered_in_turn_keep_their_own_zeros(load_module: Callable[[str], ModuleType]) -> None:
+    """As in joint training, where the fields have different numbers of Gaussians."""
+    source = RENDERER.format("len(means), 4").replace("points[:, :2]", "torch.narrow(points, 1, 0, 2)")
+    module, stages, kept = load_module(source), Stages(), []
+    ours = RasterizerWrapper(stages).renderer(module.render)
+    renderings = {count: StageRendering(False, ColorPath.NATIVE, {}) for count in (5, 7)}
+    for _ in range(2):
+        for count, rendering in renderings.items():
+            with stages.rendering_as(rendering):
+                kept.append(ours(torch.rand(count, 3))[0].data_ptr())
+    assert kept[:2] == kept[2:]
+    assert kept[0] != kept[1]
+
+
 @pytest.mark.parametrize(
     ("lines", "changes"),
     [
@@ -96,3 +112,56 @@ def test_what_is_replaced(lines: str, changes: int) -> None:
     change = ScreenPoints(tree)
     change.visit(tree)
     assert change.changes == changes
+
+
+@pytest.mark.parametrize(
+    ("lines", "changes"),
+    [
+        (
+            "if x == None:\n        x = torch.zeros(4, device='cpu')\n    s = TheSettings(a=1, x=x)",
+            1,
+        ),
+        ("if x is None:\n        x = torch.zeros((4, 2))\n    s = raster.Settings(x=x)", 1),
+        ("x = torch.zeros(4, requires_grad=True)\n    s = Settings(x=x)", 0),
+        ("x = torch.zeros(4)\n    s = Settings(x)", 0),
+        ("x = torch.zeros(4)\n    s = rasterizer(x=x)", 0),
+        ("x = torch.zeros(4)\n    x[0] = 1\n    s = Settings(x=x)", 0),
+        ("x = torch.zeros(4)\n    x += 1\n    s = Settings(x=x)", 0),
+        ("x = torch.zeros(4)\n    x.fill_(1)\n    s = Settings(x=x)", 0),
+        ("x = torch.zeros(4)\n    s = Settings(x=x)\n    return x", 0),
+        ("x = torch.ones(4)\n    s = Settings(x=x)", 0),
+    ],
+)
+def test_which_settings_are_kept(lines: str, changes: int) -> None:
+    tree: Any = ast.parse(f"def render(x=None):\n    {lines}").body[0]
+    change = SettingsZeros(tree)
+    change.visit(tree)
+    assert change.changes == changes
+
+
+def test_zeros_of_settings_are_kept_for_our_rasterizer_alone(
+    load_module: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = load_module(
+        """
+import torch
+from types import SimpleNamespace as Settings
+
+def render(size):
+    mask = torch.zeros(size, dtype=torch.int, device="cpu")
+    return Settings(mask=mask)
+"""
+    )
+    wrapper = RasterizerWrapper(Stages())
+    render = wrapper.renderer(module.render)
+    for ours in (False, True):
+        monkeypatch.setattr(RasterizerWrapper, "_renders_by_ours", ours)
+        settings = [render(size).mask for size in (4, 4, 5)]
+        assert [(mask.shape, mask.dtype, bool(mask.any())) for mask in settings] == [
+            ((size,), torch.int32, False) for size in (4, 4, 5)
+        ]
+        assert (settings[0] is settings[1]) == ours
+    settings[2].add_(1)
+    assert not render(5).mask.any(), "made again once it was written"
+    with torch.inference_mode():
+        assert not render(6).mask.any()

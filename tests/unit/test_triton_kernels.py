@@ -227,6 +227,9 @@ for shape in ((3, 7, 8), (3, 30, 45), (2, 3, 17, 150), (4, 1, 1)):
             torch.testing.assert_close(upsample_add_triton(Pyramid(grid), *images), expected, rtol=0, atol=2e-6)
         half = upsample_add_triton(Pyramid(grid), coarse.half(), fine)
         torch.testing.assert_close(half, Pyramid(grid).up(coarse.half().float(), (h, w)) + fine, rtol=0, atol=2e-6)
+        ups = [upsample_triton(Pyramid(grid), image, (h, w)) for image in (coarse.half(), coarse.half().float())]
+        assert ups[0].dtype == torch.float32
+        assert (ups[0] == ups[1]).all()
         shown = upsample_add_triton(Pyramid(grid), coarse, fine, clamped=True)
         torch.testing.assert_close(shown, expected.clamp(0, 1), rtol=0, atol=2e-6)
         leaf = fine.clone().requires_grad_()

@@ -51,6 +51,15 @@ def test_batches_and_images_that_lie_otherwise_in_memory() -> None:
     torch.testing.assert_close(upsample(Pyramid(), turned[0], (33, 50)), expected - fine, rtol=0, atol=5e-6)
 
 
+@pytest.mark.parametrize("differentiated", [True, False])
+def test_half_precision_is_upsampled_in_float32(differentiated: bool) -> None:
+    coarse = torch.randn(3, 17, 25).half()
+    expected = upsample(Pyramid(), coarse.float().requires_grad_(differentiated), (33, 50))
+    up = upsample(Pyramid(), coarse.requires_grad_(differentiated), (33, 50))
+    assert up.dtype == torch.float32
+    assert torch.equal(up, expected)
+
+
 def test_an_image_that_is_not_half_of_the_size_is_refused() -> None:
     with pytest.raises(UserInputError, match=r"Up to 33x50 .* needs an image of 17x25, got 16x25"):
         upsample(Pyramid(), torch.zeros(3, 16, 25), (33, 50))

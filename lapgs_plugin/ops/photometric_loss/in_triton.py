@@ -8,6 +8,7 @@ three maps, the derivatives of SSIM by the local means; the gradient's kernel fi
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
 from lapgs_plugin.ops.mixed_sizes import Sizes, sizes_on_device
-from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW, as_batch
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW
 
 COLORS = 3
 BLOCK = 128
@@ -31,13 +32,16 @@ ZERO_STEP = 4
 """Numbers from one to the next: `launch` wants tensors that begin at multiples of 16 bytes."""
 _zeros: dict[tuple[torch.device, int], list[tuple[Tensor, Tensor]]] = {}  # that are left, by device and stream
 
+_Launch = tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]
+"""Programs, numbers and constants of a launch."""
+
 CONSTANTS: dict[str, Any] = {"window": SSIM_WINDOW, "radius": SSIM_RADIUS, "colors": COLORS, "block": BLOCK}
 """Arguments of both kernels that they are compiled for."""
 SSIM_CONSTANTS: dict[str, Any] = {"c1": SSIM_C1, "c2": SSIM_C2}
 
 # Triton would compile a kernel again for integers that are 1 or multiples of 16, so for many image sizes.
 OF_ANY_VALUE = (
-    *("height", "width", "rows", "x_image", "x_plane", "x_row", "y_image", "y_plane", "y_row"),
+    *("height", "width", "rows", "map_size", "x_image", "x_plane", "x_row", "y_image", "y_plane", "y_row"),
     *("scale", "l1_weight", "ssim_weight"),
 )
 
@@ -109,9 +113,8 @@ def _add(
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _loss_kernel(
-    x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor, total: tl.tensor,
-    l1: tl.tensor, values: tl.tensor, sizes: tl.tensor,
-    height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
+    x: tl.tensor, y: tl.tensor, maps: tl.tensor, total: tl.tensor, l1: tl.tensor, values: tl.tensor, sizes: tl.tensor,
+    height: int, width: int, rows: int, map_size: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, mapped: tl.constexpr,
     apart: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr, window: tl.constexpr, radius: tl.constexpr,
@@ -121,7 +124,7 @@ def _loss_kernel(
 
     Args:
         x, y: prediction and target; *_image, *_plane, *_row, *_column are strides.
-        by_mean, by_square, by_product: with the strides of x.
+        maps: these three, each with the strides of x, and `map_size` numbers from one to the next.
         total: the loss, where lambda is there before, or 0 if `apart` is 1; unused if `mapped`.
         l1: L1 alone; unused unless `apart` is 1, for sizes that are not `mixed`.
         values: SSIM itself, with the strides of x; unused unless `mapped`.
@@ -174,9 +177,9 @@ def _loss_kernel(
             ssim, slope, curvature, share = _ssim(mean, mean_y, squares, products, c1, c2)
             loss -= tl.where(inside, ssim_weight * (ssim - apart), 0.0)
             here = out + (row - radius).to(tl.int64) * x_row
-            tl.store(by_mean + here, slope, inside)
-            tl.store(by_square + here, curvature, inside)
-            tl.store(by_product + here, share, inside)
+            tl.store(maps + here, slope, inside)
+            tl.store(maps + map_size + here, curvature, inside)
+            tl.store(maps + map_size + map_size + here, share, inside)
             if mapped:
                 tl.store(values + here, ssim, inside)
         row += 1
@@ -186,14 +189,14 @@ def _loss_kernel(
 
 @triton.jit(do_not_specialize=OF_ANY_VALUE)
 def _gradient_kernel(
-    x: tl.tensor, y: tl.tensor, by_mean: tl.tensor, by_square: tl.tensor, by_product: tl.tensor,
-    by_loss: tl.tensor, gradient: tl.tensor, sizes: tl.tensor,
-    height: int, width: int, rows: int, scale: float, l1_weight: float, ssim_weight: float,
+    x: tl.tensor, y: tl.tensor, maps: tl.tensor, by_loss: tl.tensor, gradient: tl.tensor, sizes: tl.tensor,
+    height: int, width: int, rows: int, map_size: int, scale: float, l1_weight: float, ssim_weight: float,
     x_image: int, x_plane: int, x_row: int, y_image: int, y_plane: int, y_row: int,
     x_column: tl.constexpr, y_column: tl.constexpr, interleaved: tl.constexpr, mixed: tl.constexpr,
     window: tl.constexpr, radius: tl.constexpr, colors: tl.constexpr, block: tl.constexpr,
 ) -> None:  # fmt: skip
     """Write the gradient by x, with the strides of x; arguments as `_loss_kernel` takes them."""
+    by_square, by_product = maps + map_size, maps + map_size + map_size
     image = tl.program_id(2).to(tl.int64)
     width, height, l1_weight, ssim_weight = _own_size(sizes + 2 * image, width, height, l1_weight, ssim_weight, mixed)
     column, color = _place(width, colors, interleaved, block, 2 * radius)
@@ -216,7 +219,7 @@ def _gradient_kernel(
         for near in tl.static_range(2 * radius + 2):
             there = (column + (near - radius)).to(tl.uint32) < limit.to(tl.uint32)
             here = at_x + row.to(tl.int64) * x_row + (near - radius) * x_column
-            mean, square = tl.load(by_mean + here, there, 0.0), tl.load(by_square + here, there, 0.0)
+            mean, square = tl.load(maps + here, there, 0.0), tl.load(by_square + here, there, 0.0)
             product = tl.load(by_product + here, there, 0.0)
             if near <= 2 * radius:
                 mean0 += window[near] * mean
@@ -240,9 +243,9 @@ def _gradient_kernel(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """Map (prediction, target, ssim_weight, sizes or None, apart), images (b, 3, h, w), to the loss.
+    """Map (prediction, target, ssim_weight, sizes or None, apart) to the loss; to (loss, L1) if `apart`, without sizes.
 
-    To (loss, L1) if `apart`, without sizes.
+    Images are (3, h, w) or (b, 3, h, w), the prediction's as `_without_gaps` returns it.
     """
 
     @staticmethod
@@ -253,16 +256,14 @@ class _PhotometricLoss(torch.autograd.Function):
             total, l1 = _two_zeros(prediction.device)
         else:
             total = l1 = torch.full((), ssim_weight, device=prediction.device)
-        assert prediction.shape[1] == COLORS, f"{prediction.shape[1]} colours"
-        maps = [torch.empty_like(prediction) for _ in range(3)]
-        assert maps[0].stride() == prediction.stride(), "a prediction without gaps"
+        maps = _empty_maps(prediction)
         own = prediction if sizes is None else sizes_on_device(sizes, prediction.device)
         programs, numbers, constants = _launch_of(prediction, target, ssim_weight, mixed=sizes is not None)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, total, l1, total, own, *numbers, **constants,
+            _loss_kernel, programs, prediction, target, maps, total, l1, total, own, *numbers, **constants,
             **SSIM_CONSTANTS, mapped=False, apart=int(apart), **CONSTANTS,
         )  # fmt: skip
-        ctx.save_for_backward(prediction, target, *maps)
+        ctx.save_for_backward(prediction, target, maps)
         ctx.ssim_weight, ctx.own = ssim_weight, None if sizes is None else own
         ctx.set_materialize_grads(False)
         return (total, l1) if apart else total
@@ -272,7 +273,7 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(
         ctx: Any, by_loss: Tensor | None, by_l1: Tensor | None = None
     ) -> tuple[Tensor | None, None, None, None, None]:
-        prediction, target, *maps = ctx.saved_tensors
+        prediction, target, maps = ctx.saved_tensors
         by_distance = None
         if by_l1 is not None:  # seldom: loops of the family only log it
             by_distance = by_l1 / prediction.numel() * (prediction - target).sign()
@@ -282,10 +283,15 @@ class _PhotometricLoss(torch.autograd.Function):
         gradient = torch.zeros_like(prediction) if mixed else torch.empty_like(prediction)
         programs, numbers, constants = _launch_of(prediction, target, ctx.ssim_weight, mixed=mixed)
         launch(
-            _gradient_kernel, programs, prediction, target, *maps, by_loss, gradient, ctx.own if mixed else gradient,
+            _gradient_kernel, programs, prediction, target, maps, by_loss, gradient, ctx.own if mixed else gradient,
             *numbers, **constants, **CONSTANTS,
         )  # fmt: skip
         return gradient if by_distance is None else gradient + by_distance, None, None, None, None
+
+
+def _empty_maps(prediction: Tensor) -> Tensor:
+    """Return room for the three maps that the loss's kernel writes."""
+    return prediction.new_empty(3 * prediction.numel())
 
 
 def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
@@ -294,12 +300,9 @@ def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
     pairs = _zeros.setdefault((device, stream), [])
     if not pairs:
         with torch.inference_mode(False):
-            block = torch.zeros(2 * PAIRS * ZERO_STEP, device=device).untyped_storage()
-            # No views: scripts may change a loss in place.
-            scalars = [
-                torch.empty(0, device=device).set_(block, ZERO_STEP * i, ())  # type: ignore[call-overload]
-                for i in range(2 * PAIRS)
-            ]
+            block = torch.zeros(2 * PAIRS, ZERO_STEP, device=device)
+            # Their data, which are no views: scripts may change a loss in place.
+            scalars = [scalar.data for scalar in block[:, 0].unbind()]
         pairs += zip(scalars[::2], scalars[1::2], strict=True)
     return pairs.pop()
 
@@ -309,49 +312,56 @@ class _SsimMap(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor) -> Tensor:
-        values, *maps = (torch.empty_like(prediction) for _ in range(4))
+        values, maps = torch.empty_like(prediction), _empty_maps(prediction)
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _loss_kernel, programs, prediction, target, *maps, values, values, values, values, *numbers, **constants,
+            _loss_kernel, programs, prediction, target, maps, values, values, values, values, *numbers, **constants,
             **SSIM_CONSTANTS, mapped=True, apart=0, **CONSTANTS,
         )  # fmt: skip
-        ctx.save_for_backward(prediction, target, *maps)
+        ctx.save_for_backward(prediction, target, maps)
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_values: Tensor) -> tuple[Tensor, None]:
-        prediction, target, *maps = ctx.saved_tensors
+        prediction, target, maps = ctx.saved_tensors
         gradient = torch.empty_like(prediction)
         # The kernel takes the derivative of a loss that has -1 / numel of each value, times a factor.
-        by_values = by_values.contiguous()
-        maps = [by_values * each for each in maps]
+        maps = (maps.view(3, -1) * by_values.reshape(-1)).view(-1)
         factor = prediction.new_full((), -prediction.numel())
         programs, numbers, constants = _launch_of(prediction, target, 1.0)
         launch(
-            _gradient_kernel, programs, prediction, target, *maps, factor, gradient, gradient, *numbers, **constants,
+            _gradient_kernel, programs, prediction, target, maps, factor, gradient, gradient, *numbers, **constants,
             **CONSTANTS,
         )  # fmt: skip
         return gradient, None
 
 
-def _launch_of(
-    prediction: Tensor, target: Tensor, ssim_weight: float, *, mixed: bool = False
-) -> tuple[tuple[int, int, int], tuple[float, ...], dict[str, int]]:
+def _launch_of(prediction: Tensor, target: Tensor, ssim_weight: float, *, mixed: bool = False) -> _Launch:
     """Return the programs of a launch, and the numbers and constants that both kernels share.
 
     Weights are those of a pixel and colour, or if sizes are `mixed` of a view and colour.
     """
-    b, _, h, w = prediction.shape
+    strides = prediction.stride(), target.stride()
+    return _launch_of_images(prediction.shape, *strides, target.dtype == torch.uint8, ssim_weight, mixed)
+
+
+@lru_cache(maxsize=256)
+def _launch_of_images(
+    shape: torch.Size, x_strides: tuple[int, ...], y_strides: tuple[int, ...], eight_bit: bool, ssim_weight: float,
+    mixed: bool,
+) -> _Launch:  # fmt: skip
+    # One image (3, h, w) is a batch of one.
+    b, colors, h, w = (1, *shape)[-4:]
+    *x_others, x_column = (0, *x_strides)[-4:]
+    *y_others, y_column = (0, *y_strides)[-4:]
+    assert colors == COLORS, f"{colors} colours"
     strips = blocks(blocks(w, 2) * COLORS, BLOCK)
     rows = rows_of_program(h, strips * b, LEAST_ROWS)
-    per_value = 1 / (b * COLORS if mixed else prediction.numel())
-    scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
+    per_value = 1 / (b * COLORS if mixed else shape.numel())
     weights = (1 - ssim_weight) * per_value, ssim_weight * per_value
-    (*x_strides, x_column), (*y_strides, y_column) = prediction.stride(), target.stride()
-    numbers = h, w, rows, scale, *weights, *x_strides, *y_strides
-    interleaved = prediction.stride(1) == 1
-    constants = {"x_column": x_column, "y_column": y_column, "interleaved": interleaved, "mixed": mixed}
+    numbers = h, w, rows, shape.numel(), 1 / 255 if eight_bit else 1.0, *weights, *x_others, *y_others
+    constants = {"x_column": x_column, "y_column": y_column, "interleaved": x_others[1] == 1, "mixed": mixed}
     return (strips, blocks(h, rows), b), numbers, constants
 
 
@@ -359,17 +369,16 @@ def photometric_loss_triton(
     prediction: Tensor, target: Tensor, ssim_weight: float, sizes: Sizes | None = None
 ) -> Tensor:
     """Do `photometric_loss` for float32 predictions on a CUDA device, of any strides; float16 and uint8 targets too."""
-    image = _without_gaps(as_batch(prediction))
-    options = as_batch(target), ssim_weight, sizes
-    loss: Tensor = _PhotometricLoss.apply(image, *options, False)  # type: ignore[no-untyped-call]  # torch's
+    options = target, ssim_weight, sizes, False
+    loss: Tensor = _PhotometricLoss.apply(_without_gaps(prediction), *options)  # type: ignore[no-untyped-call]  # torch's
     return loss
 
 
 def loss_and_l1_triton(prediction: Tensor, target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
     """Do `loss_and_l1` for float32 images on a CUDA device, of any strides."""
-    image = _without_gaps(as_batch(prediction))
-    options = as_batch(target), ssim_weight, None
-    values: tuple[Tensor, Tensor] = _PhotometricLoss.apply(image, *options, True)  # type: ignore[no-untyped-call]
+    # As a batch of one an image would take a node of the backward pass, and more operations.
+    options = target, ssim_weight, None, True
+    values: tuple[Tensor, Tensor] = _PhotometricLoss.apply(_without_gaps(prediction), *options)  # type: ignore[no-untyped-call]
     return values
 
 
@@ -381,4 +390,4 @@ def ssim_map_triton(prediction: Tensor, target: Tensor) -> Tensor:
 
 def _without_gaps(image: Tensor) -> Tensor:
     """Return an image whose maps and gradient can have its strides."""
-    return image if image.is_contiguous() or image.movedim(1, -1).is_contiguous() else image.contiguous()
+    return image if image.is_contiguous() or image.movedim(-3, -1).is_contiguous() else image.contiguous()

@@ -60,7 +60,7 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int], sizes: Siz
     """Return Up(coarse) of size (h, w), equal to `pyramid.up(coarse, size)` up to rounding, with its gradient.
 
     Args:
-        coarse: as `upsample_add` takes it.
+        coarse: as `upsample_add` takes it; the result is float32 for float16.
         size: (h, w) of the result.
         sizes: as `upsample_add` takes them.
 
@@ -71,11 +71,13 @@ def upsample(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int], sizes: Siz
     if sizes is not None:
         pairs = zip(_halves(coarse, sizes), sizes, strict=True)
         return stack_padded([upsample(pyramid, image, (height, width)) for image, (width, height) in pairs])
+    if coarse.dtype == torch.float16 and not _is_read_in_half(coarse):
+        coarse = coarse.float()
     if _fits_numba(coarse) and not are_differentiated(coarse):
         from lapgs_plugin.ops.upsample.in_numba import upsample_cpu
 
         return upsample_cpu(pyramid, coarse, size)
-    if not triton_works(coarse):
+    if not (coarse.dtype == torch.float16 or triton_works(coarse)):
         return pyramid.up(coarse, size)
     from lapgs_plugin.ops.upsample.in_triton import upsample_triton
 
@@ -90,6 +92,11 @@ def _halves(coarse: Tensor, sizes: Sizes) -> list[Tensor]:
 def are_differentiated(*images: Tensor) -> bool:
     """Return whether gradients by one of the images are recorded."""
     return torch.is_grad_enabled() and any(image.requires_grad for image in images)
+
+
+def _is_read_in_half(coarse: Tensor) -> bool:
+    """Return whether our kernel reads a float16 image as it is, which takes an operation less."""
+    return coarse.is_cuda and not are_differentiated(coarse) and triton_works()
 
 
 def _fits_numba(image: Tensor) -> bool:

@@ -113,7 +113,7 @@ def upsample_add_triton(
 
 
 def upsample_triton(pyramid: Pyramid, coarse: Tensor, size: tuple[int, int]) -> Tensor:
-    """Do `upsample` for a float32 image on a CUDA device, with any strides."""
+    """Do `upsample` for an image on a CUDA device, with any strides: float32, or float16 without gradient."""
     if not are_differentiated(coarse):
         return _upsampled(pyramid.grid, size, coarse)
     options = pyramid.grid, size, None
@@ -155,7 +155,8 @@ def _upsampled(
     sizes: Sizes | None = None,
 ) -> Tensor:  # fmt: skip
     """Return Up(coarse) + fine of this size, without a gradient."""
-    out = coarse.new_empty(*coarse.shape[:-2], *size) if fine is None else torch.empty_like(fine)
+    shape = *coarse.shape[:-2], *size
+    out = coarse.new_empty(shape, dtype=torch.float32) if fine is None else torch.empty_like(fine)
     if sizes is None:
         _filter(coarse, grid, size, out, fine, clamps=clamps)
         return out
@@ -176,23 +177,41 @@ def _filter(
         transposed: the sums are those of the gradient.
         only: number of the image to filter, in its top left part; None filters all. Taps depend on the size.
     """
-    tensors = (source, out if added is None else added, out)
-    images = [image if image.ndim == 4 else image[None] for image in tensors]  # (b, c, ..., ...) each
+    images = source, out if added is None else added, out
+    strides = images[0].stride(), images[1].stride(), images[2].stride()
+    options = added is not None, clamps, transposed, only
+    programs, taps, numbers, constants = _launch_of(grid, size, source.device, out.shape, strides, *options)
+    launch(_kernel, programs, *images, *taps, *numbers, **constants)
+
+
+@lru_cache(maxsize=256)
+def _launch_of(
+    grid: str, size: tuple[int, int], device: torch.device, shape: torch.Size, strides: tuple[tuple[int, ...], ...],
+    adds: bool, clamps: bool, transposed: bool, only: int | None,
+) -> tuple[tuple[int, int, int], tuple[Tensor, ...], tuple[int, ...], dict[str, Any]]:  # fmt: skip
+    """Return the programs of a launch, its taps, numbers and constants.
+
+    Args:
+        shape: of the result.
+        strides: of source, added image and result.
+        grid, size, device, adds, clamps, transposed, only: as of `_filter`.
+    """
     taps = _up_transposed if transposed else _up
-    rows, columns = (taps(grid, side, source.device) for side in size)
-    b, planes = (images[2].shape[0] if only is None else 1), images[2].shape[1]
+    rows, columns = (taps(grid, side, device) for side in size)
+    # One image (c, h, w) is a batch of one.
+    b, planes, _, _ = (1, *shape)[-4:]
+    b = b if only is None else 1
     height, width = len(rows.first), len(columns.first)
     strips = blocks(planes * width, BLOCK)
     count = rows_of_program(height, strips * b, LEAST_ROWS)
-    source_column, added_column, out_column = (image.stride(3) for image in images)
-    launch(
-        _kernel, (strips, blocks(height, count), b),
-        *images, *rows, *columns, height, width, count, only or 0,
-        *(stride for image in images for stride in image.stride()[:3]),
-        source_column=source_column, added_column=added_column, out_column=out_column,
-        adds=added is not None, clamps=clamps, planes=planes, interleaved=images[2].stride(1) == 1,
-        taps_down=rows.weights.shape[1], taps_across=columns.weights.shape[1], block=BLOCK,
-    )  # fmt: skip
+    of_source, of_added, of_out = ((0, *stride)[-4:] for stride in strides)
+    numbers = height, width, count, only or 0, *of_source[:3], *of_added[:3], *of_out[:3]
+    constants = {
+        "source_column": of_source[3], "added_column": of_added[3], "out_column": of_out[3],
+        "adds": adds, "clamps": clamps, "planes": planes, "interleaved": of_out[1] == 1,
+        "taps_down": rows.weights.shape[1], "taps_across": columns.weights.shape[1], "block": BLOCK,
+    }  # fmt: skip
+    return (strips, blocks(height, count), b), (*rows, *columns), numbers, constants
 
 
 @lru_cache(maxsize=256)
