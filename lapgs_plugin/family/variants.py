@@ -112,6 +112,8 @@ def _with_sums(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """
     size = settings.image_height, settings.image_width
     empty, whole = output.image.new_empty(0), output.radii.new_empty(0)
+    assert output.centres is not None
+    assert output.depths is not None
     counts = output.radii.new_zeros(size) if _weight_rows(settings) else whole
     sums: tuple[Tensor, ...] = empty, whole, empty, empty
     if output.contributions is not None:
@@ -180,7 +182,9 @@ BACKBONES = {
         (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
         options=lambda settings: (
-            Options(sums=SUMS, pixel_weights=_weights(settings)) if _weight_rows(settings) > 1 else Options()
+            Options(sums=SUMS, pixel_weights=_weights(settings), positions=True)
+            if _weight_rows(settings) > 1
+            else Options(positions=True)
         ),
         outputs=_with_sums,
         binding=DcApart,
