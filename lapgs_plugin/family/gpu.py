@@ -197,7 +197,7 @@ class _Rasterize(torch.autograd.Function):
             return None, *(None if part is None else torch.zeros_like(part) for part in ctx.saved_tensors)
         *saved, radii, records, image, inverse_depths, counts, words = ctx.saved_tensors
         parameters, first, (offsets, flat) = Parameters(*saved[:5]), saved[5], saved[6:]
-        by_image = torch.zeros_like(image) if by_image is None else by_image.contiguous().view(image.shape)
+        by_image = torch.zeros_like(image) if by_image is None else by_image.contiguous()
         # Most losses do not use depths, which take a third of the time of blending's backward pass.
         rules = call.rules._replace(depth=call.rules.depth and by_depths is not None)
         depths = (inverse_depths, by_depths.contiguous()) if rules.depth and by_depths is not None else None

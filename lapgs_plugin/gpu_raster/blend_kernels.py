@@ -321,7 +321,7 @@ def blend_backward(
         records: (c, n, RECORD).
         offsets, flat: as `blend_forward` takes them.
         images, counts, words: its results, or those of `blend_family`, made with the same shape.
-        by_images: gradient by the images.
+        by_images: as many numbers, the gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
         rules: those that the images were made by.

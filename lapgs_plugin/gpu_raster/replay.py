@@ -21,9 +21,10 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
+from lapgs_plugin.gpu_raster.late_number import LateNumber, new_slot
 from lapgs_plugin.gpu_raster.records import GRADIENT, MOST_OTHERS, RECORD, grid_of
 from lapgs_plugin.gpu_raster.rules import Rules
-from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS, Blending, LateNumber, Tiles, blend_and_sum, new_slot
+from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS, Blending, Tiles, blend_and_sum
 
 T = TypeVar("T")
 Destination = tuple[Tensor, Tensor, Tensor, Tensor]
