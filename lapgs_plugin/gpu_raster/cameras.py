@@ -1,4 +1,4 @@
-"""Copy cameras to the device that renders."""
+"""Copy cameras to the device that renders, or make them there of matrices, once each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
-from lapgs_plugin.gpu_raster.records import aligned
+from lapgs_plugin.gpu_raster.records import aligned, state_of
 from lapgs_plugin.ops.mixed_sizes import if_mixed, largest_size, sizes_on_device
 
 NUMBERS_OF_16_BYTES = 4
@@ -78,7 +78,7 @@ class CameraCache:
 
 
 class _OfMatrices(NamedTuple):
-    """Hold a camera, the matrices that it was made of, and their versions with all else that it depends on."""
+    """Hold a camera, the matrices that it was made of, and their states with all else that it depends on."""
 
     view: weakref.ref[Tensor]
     full: weakref.ref[Tensor]
@@ -90,7 +90,7 @@ class _OfMatrices(NamedTuple):
 class MatrixCameras:
     """Make the camera of a view's matrices once, because training views come back many times.
 
-    Matrices are the same ones if they are the same objects, and PyTorch knows of no change in place.
+    Matrices are the same ones if they are the same objects, and `state_of` them is the same.
     """
 
     def __init__(self) -> None:
@@ -113,14 +113,14 @@ class MatrixCameras:
             and made.view() is view
             and made.full() is full
             and made.centre() is centre
-            and made.state == (view._version, full._version, centre._version, *here)
+            and made.state == (*state_of(view), *state_of(full), *state_of(centre), *here)
         ):
             return made.camera
         camera = _camera_of(view, full, centre, tangents, size, like)
         tracked = not (view.is_inference() or full.is_inference() or centre.is_inference())
         if tracked and not _is_recording(like):
             known = weakref.ref(view, lambda _: self._made.pop(key, None))
-            state = view._version, full._version, centre._version, *here
+            state = *state_of(view), *state_of(full), *state_of(centre), *here
             self._made[key] = _OfMatrices(known, weakref.ref(full), weakref.ref(centre), state, camera)
         return camera
 

@@ -59,6 +59,14 @@ def aligned(part: Tensor) -> Tensor:
     return part if part.data_ptr() % ALIGNMENT == 0 else part.clone()
 
 
+def state_of(tensor: Tensor) -> tuple[int, int]:
+    """Return numbers that change when PyTorch knows that a tensor's values do.
+
+    It does not know of changes in place through `.data`. Tensors of inference mode have no state.
+    """
+    return tensor._version, tensor.data_ptr()
+
+
 class Projected(NamedTuple):
     """Hold n Gaussians as c cameras see them. Where culled, radii are 0, and only what is visible has a meaning.
 

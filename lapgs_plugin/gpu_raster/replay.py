@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.gpu_raster.late_number import LateNumber, new_slot
-from lapgs_plugin.gpu_raster.records import GRADIENT, MOST_OTHERS, RECORD, grid_of
+from lapgs_plugin.gpu_raster.records import GRADIENT, MOST_OTHERS, RECORD, grid_of, state_of
 from lapgs_plugin.gpu_raster.rules import Rules
 from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS, Blending, Tiles, blend_and_sum
 
@@ -144,7 +144,7 @@ class Frame:
         self._records = like.new_empty(1, room, RECORD)
         self.by_records = like.new_empty(room * (GRADIENT + MOST_OTHERS))
         self._background = like.new_empty(3)
-        self._copied_background: tuple[weakref.ref[Tensor], int] | None = None  # and its version
+        self._copied_background: tuple[weakref.ref[Tensor], tuple[int, int]] | None = None  # and its state
         self._n = 0
         self._of_view = self._slices()
         self._user: weakref.ref[Tensor] | None = None
@@ -191,10 +191,10 @@ class Frame:
     def _set_background(self, background: Tensor) -> None:
         """Copy a background, unless it is the one of the view before."""
         before = self._copied_background
-        if before is None or before[0]() is not background or before[1] != background._version:
+        if before is None or before[0]() is not background or before[1] != state_of(background):
             self._background.copy_(background)
             tracked = not background.is_inference()
-            self._copied_background = (weakref.ref(background), background._version) if tracked else None
+            self._copied_background = (weakref.ref(background), state_of(background)) if tracked else None
 
     def _sort(self) -> Tiles:
         from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth

@@ -70,7 +70,9 @@ def current_stream(device: torch.device) -> int:
     """Return the number of a device's current stream; 0 for a CPU, where kernels are interpreted."""
     if device.type == "cpu":
         return 0
-    number: int = triton.runtime.driver.active.get_current_stream(device.index)
+    if not STARTS_DIRECTLY:
+        return torch.cuda.current_stream(device).cuda_stream
+    number: int = triton.runtime.driver.active.get_current_stream(device.index)  # takes a tenth of the time
     return number
 
 
