@@ -278,6 +278,9 @@ for name in ("viewmatrix", "projmatrix", "campos"):
     getattr(first, name).copy_(getattr(second, name))
 check("changed in place", first, expected[1])
 for name in ("viewmatrix", "projmatrix", "campos"):
+    getattr(first, name).data = getattr(settings_of(case, DEVICE), name)
+check("other memory", first, expected[0])
+for name in ("viewmatrix", "projmatrix", "campos"):
     setattr(second, name, getattr(settings_of(case, DEVICE), name))
 check("other tensors", second, expected[0])
 second.tanfovx = 1.1 * second.tanfovx
