@@ -371,7 +371,10 @@ weighted = Options(sums=("weights", "counts"), pixel_weights=torch.rand(160 * 90
 kinds = {"whole": (whole, EVERYTHING), "half": (half, EVERYTHING), "bare": (whole, Options())}
 kinds |= {"shares": (whole, shares), "weighted": (whole, weighted)}
 plain = {name: differentiate(render(case, False, options)) for name, (case, options) in kinds.items()}
-for i in range(replay.REPEATED + 2):
+for name, (case, options) in kinds.items():
+    for i in range(replay.REPEATED):
+        check(f"{name} alone {i}", differentiate(render(case, True, options)), plain[name])
+for i in range(3):
     views = {name: render(case, True, options) for name, (case, options) in kinds.items()}
     for name, view in views.items():
         check(f"{name} {i}", differentiate(view), plain[name])
