@@ -83,6 +83,7 @@ class Options:
         sums: those of `SUMS` to compute.
         pixel_weights: (height * width,) float32, if "weights" is among them.
         blending: return how each pixel is blended.
+        positions: return centres and depths.
     """
 
     mult: float | None = None
@@ -93,6 +94,7 @@ class Options:
     sums: tuple[str, ...] = ()
     pixel_weights: Tensor | None = None
     blending: bool = False
+    positions: bool = False
 
 
 SUMS = ("weights", "counts", "blending", "distances")
@@ -157,8 +159,8 @@ class Output:
         image: (3, height, width).
         radii: (n,) int32, 0 where culled.
         inverse_depths: (1, height, width), or None if not asked for.
-        centres: (n, 2) pixels, 0 where culled.
-        depths: (n,) camera-space z, 0 where culled.
+        centres: (n, 2) pixels, 0 where culled, or None if not asked for.
+        depths: (n,) camera-space z, 0 where culled, or None if not asked for.
         contributions: None if no sums are asked for.
         blending: None if not asked for.
     """
@@ -166,8 +168,8 @@ class Output:
     image: Tensor
     radii: Tensor
     inverse_depths: Tensor | None
-    centres: Tensor
-    depths: Tensor
+    centres: Tensor | None
+    depths: Tensor | None
     contributions: Contributions | None = None
     blending: Blending | None = None
 

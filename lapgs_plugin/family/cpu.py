@@ -50,6 +50,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     )
     image, inverse_depths, radii, centres, depths = _Rasterize.apply(call, *inputs)  # type: ignore[no-untyped-call]  # torch's
     inverse_depths = inverse_depths if options.inverse_depth else None
+    centres, depths = (centres, depths) if options.positions else (None, None)
     return Output(image, radii, inverse_depths, centres, depths, call.contributions, call.blending)
 
 

@@ -20,6 +20,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
 from lapgs_plugin.family.call import Blending, Inputs, Options, Output, ShParts, depths_of
 from lapgs_plugin.family.engine import rasterize
+from lapgs_plugin.gpu_raster.late_number import LateNumber
 from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
 
@@ -183,23 +184,17 @@ class MipSplatting(WholeSh):
         return super()._render(inputs._replace(means2d=four))
 
 
-_arriving: deque[tuple[Any, Tensor]] = deque()
-"""Flags of calls on a GPU, on their way to the processor."""
+_arriving: deque[LateNumber] = deque()
+"""Whether pixels were moved in calls on a GPU, on its way to the processor."""
 
 
 def _require_no_offset(settings: Any) -> None:
     """Refuse pixels that are moved; on a GPU a few calls later, because asking it at once would wait for it."""
-    moved = settings.subpixel_offset.any()
-    if moved.is_cuda:
-        flag = torch.empty((), dtype=torch.bool, pin_memory=True)
-        event: Any = torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
-        flag.copy_(moved, non_blocking=True)
-        event.record()
-        _arriving.append((event, flag))
-        moved = torch.zeros((), dtype=torch.bool)
-        while _arriving and _arriving[0][0].query():
-            moved |= _arriving.popleft()[1]
-    if bool(moved):
+    _arriving.append(LateNumber.of(settings.subpixel_offset.any()))
+    moved = 0
+    while _arriving and _arriving[0].has_arrived():
+        moved |= _arriving.popleft().read()
+    if moved:
         raise UserInputError(
             "our version of Mip-Splatting's rasterizer has no subpixel_offset, expected all zeros; leave out "
             "--ray_jitter, or train with its own CUDA extension"
@@ -207,11 +202,11 @@ def _require_no_offset(settings: Any) -> None:
 
 
 class _Padded(torch.autograd.Function):
-    """Map (n, 3) to (n, 4); the gradient's last two columns are added up."""
+    """Map (n, 3) to (n, 4) of which only the gradient is used; its last two columns are added up."""
 
     @staticmethod
     def forward(ctx: Any, points: Tensor) -> Tensor:
-        return points.new_zeros(len(points), 4)
+        return points.new_empty(len(points), 4)
 
     @staticmethod
     @once_differentiable
@@ -228,7 +223,7 @@ class PixelGS(WholeSh):
         if settings.depth_threshold is not None and points.requires_grad:
             depths = depths_of(inputs.means.detach(), settings.viewmatrix)
             factors = (depths / settings.depth_threshold).square().clamp(max=1)[:, None]
-            points = points * factors + (points * (1 - factors)).detach()
+            points = _Scaled.apply(points, factors)  # type: ignore[no-untyped-call]  # torch's
         return super()._render(inputs._replace(means2d=points))
 
 

@@ -40,9 +40,13 @@ _FAMILY = (*_VIEW, "prefiltered", "debug")
 _TWO = ("image", "radii")
 
 
-def _no_options(settings: Any) -> Options:
-    """Ask for nothing but an image."""
-    return Options()
+def _always(options: Options) -> Callable[[Any], Options]:
+    """Return the same options for all settings."""
+    return lambda settings: options
+
+
+_ALONE = _always(Options())
+"""Ask for nothing but an image."""
 
 
 def _image_and_radii(settings: Any, output: Output) -> tuple[Tensor, ...]:
@@ -73,7 +77,7 @@ class Variant:
 
     description: str
     settings: tuple[str, ...] = _FAMILY
-    options: Callable[[Any], Options] = _no_options
+    options: Callable[[Any], Options] = _ALONE
     outputs: Callable[[Any, Output], tuple[Tensor, ...]] = _image_and_radii
     returned: tuple[str, ...] = ()
     module: str = "diff_gaussian_rasterization"
@@ -112,6 +116,8 @@ def _with_sums(settings: Any, output: Output) -> tuple[Tensor, ...]:
     """
     size = settings.image_height, settings.image_width
     empty, whole = output.image.new_empty(0), output.radii.new_empty(0)
+    assert output.centres is not None
+    assert output.depths is not None
     counts = output.radii.new_zeros(size) if _weight_rows(settings) else whole
     sums: tuple[Tensor, ...] = empty, whole, empty, empty
     if output.contributions is not None:
@@ -180,7 +186,9 @@ BACKBONES = {
         (*_FAMILY, "pixel_weights"),
         # The CUDA code looks at the number of rows, not of pixels.
         options=lambda settings: (
-            Options(sums=SUMS, pixel_weights=_weights(settings)) if _weight_rows(settings) > 1 else Options()
+            Options(sums=SUMS, pixel_weights=_weights(settings), positions=True)
+            if _weight_rows(settings) > 1
+            else Options(positions=True)
         ),
         outputs=_with_sums,
         binding=DcApart,
@@ -211,7 +219,7 @@ BACKBONES = {
 
 _MINI_SPLATTING = Variant(
     "Stand in for the rasterizer of Mini-Splatting: with shares, and points at the depth of Gaussians.",
-    options=lambda settings: forks.SHARES,
+    options=_always(forks.SHARES),
     outputs=forks.with_shares,
     module="diff_gaussian_rasterization_ms",
     binding=forks.MiniSplatting,
@@ -231,13 +239,13 @@ FORKS = {
     ),
     "3dgs-mcmc": Variant(
         "Stand in for the rasterizer of 3dgs-mcmc: with the relocation of Gaussians.",
-        options=lambda settings: Options(sums=("counts",)),
+        options=_always(Options(sums=("counts",))),
         outputs=_with_blended,
         functions=(forks.compute_relocation,),
     ),
     "absgs": Variant(
         "Stand in for the rasterizer of AbsGS: with absolute gradients and the sum of shares.",
-        options=lambda settings: Options(sums=("blending",)),
+        options=_always(Options(sums=("blending",))),
         outputs=_with_total_share,
         module="diff_gaussian_rasterization_abs",
     ),
@@ -259,7 +267,7 @@ FORKS = {
     "pixel-gs": Variant(
         "Stand in for the rasterizer of Pixel-GS: with the pixels of each Gaussian, and gradients scaled by depth.",
         (*_VIEW[:6], "depth_threshold", *_VIEW[6:], "prefiltered", "debug"),
-        options=lambda settings: Options(sums=("counts",)),
+        options=_always(Options(sums=("counts",))),
         outputs=_with_pixels,
         binding=forks.PixelGS,
     ),

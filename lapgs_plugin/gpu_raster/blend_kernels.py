@@ -21,7 +21,7 @@ import triton.language as tl
 from torch import Tensor
 
 from lapgs_plugin.gpu_raster.memory_kernels import at_most
-from lapgs_plugin.gpu_raster.records import GRADIENT, RECORD, TILE
+from lapgs_plugin.gpu_raster.records import GRADIENT, OTHERS, RECORD, TILE
 from lapgs_plugin.gpu_raster.rules import GSPLAT, Rules
 from lapgs_plugin.gpu_raster.walk_kernels import (
     COLUMNS,
@@ -55,12 +55,6 @@ from lapgs_plugin.ops.launch import launch
 
 OF_GRADIENT = tl.constexpr(GRADIENT)
 """Numbers of a Gaussian's gradients that lie together."""
-OTHERS = {(False, False): 1, (True, False): 3, (False, True): 3, (True, True): 5}
-"""Numbers of a Gaussian's other gradients, by whether there are absolute sums, and 1 / depth.
-
-They are that by c; two absolute sums, or one without meaning; that by 1 / depth. The number is odd, so that addresses
-of several lanes have no order in which Triton would spread them over threads, see `_backward_kernel`.
-"""
 FORWARD_REGISTERS = 72
 """Most registers of a forward kernel's thread.
 
@@ -319,7 +313,7 @@ def _blend(
 def blend_backward(
     records: Tensor, offsets: Tensor, flat: Tensor, images: Tensor, counts: Tensor, words: Tensor,
     by_images: Tensor, absolute: bool, shape: Shape = SHAPE, rules: Rules = GSPLAT,
-    inverse_depths: tuple[Tensor, Tensor] | None = None,
+    inverse_depths: tuple[Tensor, Tensor] | None = None, zeros: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the gradients of blending by what it read of each Gaussian; arguments are contiguous.
 
@@ -327,11 +321,12 @@ def blend_backward(
         records: (c, n, RECORD).
         offsets, flat: as `blend_forward` takes them.
         images, counts, words: its results, or those of `blend_family`, made with the same shape.
-        by_images: gradient by the images.
+        by_images: as many numbers, the gradient by the images.
         absolute: also sum the absolute values of the gradient by centres.
         shape: of a program's work.
         rules: those that the images were made by.
         inverse_depths: with `rules.depth`, those of `blend_family`, or opacities, and the gradient by them.
+        zeros: (c * n * (GRADIENT + OTHERS),) or more, to be used for the result; None for new ones.
 
     Returns:
         Gradients (c, n, GRADIENT) by red, green, blue, opacity, x, y, a and b; and the others (c, n, OTHERS).
@@ -339,8 +334,11 @@ def blend_backward(
     programs, numbers = launch_of(offsets, flat, _size_of(images, rules), images.shape[0], shape)
     assert counts.numel() == programs
     count, stride = records.numel() // RECORD, OTHERS[absolute, rules.depth]
-    zeros = records.new_zeros((GRADIENT + stride) * count)  # in one launch
-    gradients, others = zeros[: GRADIENT * count], zeros[GRADIENT * count :]
+    if zeros is None:
+        zeros = records.new_zeros((GRADIENT + stride) * count)  # in one launch
+    first, leading = GRADIENT * count, records.shape[:-1]
+    gradients = zeros[:first].view(*leading, GRADIENT)
+    others = zeros[first : first + stride * count].view(*leading, stride)
     launch(
         _backward_kernel, (programs,),
         records, offsets, flat, words, counts, images, by_images, *(inverse_depths or (images, images)),
@@ -349,8 +347,7 @@ def blend_backward(
         absolute=absolute, family=rules.family, depth=rules.depth, stride=stride, num_warps=1,
         **at_most(BACKWARD_REGISTERS),
     )  # fmt: skip
-    leading = records.shape[:-1]
-    return gradients.view(*leading, GRADIENT), others.view(*leading, stride)
+    return gradients, others
 
 
 def _size_of(images: Tensor, rules: Rules) -> tuple[int, int]:

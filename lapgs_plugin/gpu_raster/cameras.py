@@ -1,15 +1,16 @@
-"""Copy cameras to the device that renders."""
+"""Copy cameras to the device that renders, or make them there of matrices, once each."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lapgs_plugin.fields.camera import Camera
+from lapgs_plugin.gpu_raster.records import aligned, state_of
 from lapgs_plugin.ops.mixed_sizes import if_mixed, largest_size, sizes_on_device
 
 NUMBERS_OF_16_BYTES = 4
@@ -74,6 +75,69 @@ class CameraCache:
             alone = DeviceCameras(poses, intrinsics, centres, camera.width, camera.height)
             copied = cache[key] = _Copied(known, alone, *flat)
         return copied
+
+
+class _OfMatrices(NamedTuple):
+    """Hold a camera, the matrices that it was made of, and their states with all else that it depends on."""
+
+    view: weakref.ref[Tensor]
+    full: weakref.ref[Tensor]
+    centre: weakref.ref[Tensor]
+    state: tuple[Any, ...]
+    camera: DeviceCameras
+
+
+class MatrixCameras:
+    """Make the camera of a view's matrices once, because training views come back many times.
+
+    Matrices are the same ones if they are the same objects, and `state_of` them is the same.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, tuple[int, int]], _OfMatrices] = {}
+
+    def get(
+        self, view: Tensor, full: Tensor, centre: Tensor, tangents: tuple[float, float], size: tuple[int, int],
+        like: Tensor, stream: int,
+    ) -> DeviceCameras:  # fmt: skip
+        """Return the camera of matrices as `kernels.camera_of` takes them, on any device.
+
+        Args:
+            like: a tensor on the device that renders.
+            stream: number of its current one.
+        """
+        key, here = (id(view), size), (*tangents, like.device, stream)
+        made = self._made.get(key)
+        if (
+            made is not None
+            and made.view() is view
+            and made.full() is full
+            and made.centre() is centre
+            and made.state == (*state_of(view), *state_of(full), *state_of(centre), *here)
+        ):
+            return made.camera
+        camera = _camera_of(view, full, centre, tangents, size, like)
+        tracked = not (view.is_inference() or full.is_inference() or centre.is_inference())
+        if tracked and not _is_recording(like):
+            known = weakref.ref(view, lambda _: self._made.pop(key, None))
+            state = *state_of(view), *state_of(full), *state_of(centre), *here
+            self._made[key] = _OfMatrices(known, weakref.ref(full), weakref.ref(centre), state, camera)
+        return camera
+
+
+def _camera_of(
+    view: Tensor, full: Tensor, centre: Tensor, tangents: tuple[float, float], size: tuple[int, int], like: Tensor
+) -> DeviceCameras:
+    from lapgs_plugin.gpu_raster.kernels import camera_of
+
+    view, full, centre = (matrix.detach().to(like) for matrix in (view, full, centre))
+    # Scripts cut the centre out of an inverse: where it lies, only Triton's own launch would start the kernel.
+    return camera_of(view, full, aligned(centre), tangents, size)
+
+
+def _is_recording(like: Tensor) -> bool:
+    """Return whether launches are recorded into a graph, so that they have no results yet."""
+    return like.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
 def cameras_on_device(cameras: Sequence[Camera], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -281,9 +281,10 @@ def _project_kernel(
     visible_radii: tl.tensor, visible_pixels: tl.tensor,
     width: int, height: int, n: int, first: int, cameras: int, active: int, signed: int, start: int,
     modifier: float, blur: float, mult: float, closest: float, farthest: float,
-    coefficients: tl.constexpr, with_geometry: tl.constexpr, record: tl.constexpr, block: tl.constexpr,
-    tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr, dimmed: tl.constexpr,
-    exact: tl.constexpr, snug: tl.constexpr, activated: tl.constexpr, alpha: tl.constexpr, mixed: tl.constexpr,
+    coefficients: tl.constexpr, with_radii: tl.constexpr, with_centres: tl.constexpr, record: tl.constexpr,
+    block: tl.constexpr, tile: tl.constexpr, family: tl.constexpr, covariances: tl.constexpr, apart: tl.constexpr,
+    dimmed: tl.constexpr, exact: tl.constexpr, snug: tl.constexpr, activated: tl.constexpr, alpha: tl.constexpr,
+    mixed: tl.constexpr,
 ) -> None:  # fmt: skip
     rows = tl.program_id(0) * block + tl.arange(0, block)
     here, row = rows < n, tl.minimum(rows, n - 1)
@@ -351,12 +352,12 @@ def _project_kernel(
         store_four(into, pixel_x, pixel_y, high * inverse, -skew * inverse, visible)
         store_four(into + 4, wide * inverse, effective, effective, effective, visible)
         store_four(into + 8, red, green, blue, 0.0 * near + 1.0 if alpha else near, visible)
-        if with_geometry:
+        if with_radii:
             tl.store(visible_radii + placed, tl.where(seen, radius, 0).to(tl.int32), here)
+        if with_centres:
             tl.store(visible_pixels + 2 * placed, tl.where(seen, pixel_x - 0.5, 0.0), here)
             tl.store(visible_pixels + 2 * placed + 1, tl.where(seen, pixel_y - 0.5, 0.0), here)
-        camera += 1
-        placed += n
+        camera, placed = camera + 1, placed + n
 
 
 @triton.jit
@@ -636,17 +637,18 @@ def camera_of(
 def project(
     parameters: Parameters, cameras: DeviceCameras, degree: int, signed: bool, with_geometry: bool = False,
     rules: Rules = GSPLAT, numbers: Numbers = NUMBERS, first: Tensor | None = None,
-    into: Sequence[Tensor] | None = None,
+    into: Sequence[Tensor] | None = None, with_centres: bool = True,
 ) -> Projected:  # fmt: skip
     """Project at least one Gaussian, and evaluate its colour.
 
     Args:
         degree: highest of SH to evaluate.
         signed: whether colours are the raw SH values.
-        with_geometry: fill in visible radii and centres.
+        with_geometry: fill in visible radii, and centres if `with_centres`.
         rules, numbers: those of `parameters`, too.
         first: (n, 1, 3) first coefficients, if they are apart.
         into: radii, centres, depths and records to write to, as in `Projected`; None for new ones.
+        with_centres: else those of the result have no meaning.
     """
     count, n, like = cameras.poses.shape[0], parameters.means.shape[0], parameters.means
     if into is None:
@@ -655,12 +657,13 @@ def project(
             like.new_empty(count, n), like.new_empty(count, n, RECORD),
         )  # fmt: skip
     radii, means2d, depths, records = into
-    described = n if with_geometry else 0
+    rows = n if with_geometry else 0
     projected = Projected(
-        radii, means2d, depths, records,
-        like.new_empty(count, described, dtype=torch.int32), like.new_empty(count, described, 2),
+        radii, means2d, depths, records, like.new_empty(count, rows, dtype=torch.int32),
+        like.new_empty(count, rows, 2) if with_centres else means2d,
     )  # fmt: skip
-    _project(parameters, first, cameras, (0, count), degree, signed, projected, 0, with_geometry, rules, numbers)
+    described = with_geometry, with_geometry and with_centres
+    _project(parameters, first, cameras, (0, count), degree, signed, projected, 0, described, rules, numbers)
     return projected
 
 
@@ -677,7 +680,7 @@ def project_into(
     """
     projected = Projected(*stacked, *stacked[:2])
     degree = math.isqrt(parameters.sh.shape[1]) - 1
-    _project(parameters, None, cameras, (camera, 1), degree, signed, projected, start, False, GSPLAT, NUMBERS)
+    _project(parameters, None, cameras, (camera, 1), degree, signed, projected, start, (False, False), GSPLAT, NUMBERS)
 
 
 def _sizes_of(cameras: DeviceCameras) -> Tensor:
@@ -692,15 +695,16 @@ def _coefficients(sh: Tensor, rules: Rules) -> int:
 
 def _project(
     parameters: Parameters, first: Tensor | None, cameras: DeviceCameras, chosen: tuple[int, int], degree: int,
-    signed: bool, into: Projected, start: int, with_geometry: bool, rules: Rules, numbers: Numbers,
+    signed: bool, into: Projected, start: int, described: tuple[bool, bool], rules: Rules, numbers: Numbers,
 ) -> None:  # fmt: skip
+    """Launch the projection; `described` says whether visible radii and centres are wanted."""
     n = parameters.means.shape[0]
     launch(
         _project_kernel, (blocks(n, BLOCK),),
         *parameters, parameters.sh if first is None else first, *cameras[:3], _sizes_of(cameras), *into,
         cameras.width, cameras.height, n, *chosen, (degree + 1) ** 2, int(signed), start, *numbers,
-        coefficients=_coefficients(parameters.sh, rules), with_geometry=with_geometry,
-        record=RECORD, block=BLOCK, tile=TILE,
+        coefficients=_coefficients(parameters.sh, rules), with_radii=described[0],
+        with_centres=described[1], record=RECORD, block=BLOCK, tile=TILE,
         family=rules.family, covariances=rules.covariances, apart=rules.apart, dimmed=rules.dimmed,
         exact=rules.exact, snug=rules.snug, activated=rules.activated, alpha=rules.alpha,
         mixed=cameras.sizes is not None,

@@ -17,6 +17,13 @@ COLOR_IN_RECORD = 8
 """Index in a record at which its colour begins."""
 GRADIENT = 8
 """Numbers of its first gradients: by red, green, blue, opacity, x, y, a and b. That by c lies elsewhere."""
+OTHERS = {(False, False): 1, (True, False): 3, (False, True): 3, (True, True): 5}
+"""Numbers of a Gaussian's other gradients, by whether there are absolute sums, and 1 / depth.
+
+They are that by c; two absolute sums, or one without meaning; that by 1 / depth. The number is odd, so that addresses
+of several lanes have no order in which Triton would spread them over threads, see `blend_kernels._backward_kernel`.
+"""
+MOST_OTHERS = max(OTHERS.values())
 ALIGNMENT = 16
 """Bytes that our kernels read at once."""
 
@@ -50,6 +57,14 @@ def aligned(part: Tensor) -> Tensor:
     """Return a tensor as kernels read it, copied where it lies in memory in another way."""
     part = part.contiguous()
     return part if part.data_ptr() % ALIGNMENT == 0 else part.clone()
+
+
+def state_of(tensor: Tensor) -> tuple[int, int]:
+    """Return numbers that change when PyTorch knows that a tensor's values do.
+
+    It does not know of changes in place through `.data`. Tensors of inference mode have no state.
+    """
+    return tensor._version, tensor.data_ptr()
 
 
 class Projected(NamedTuple):

@@ -4,6 +4,9 @@ A graph reads and writes the same memory each time. So projection writes to memo
 blend in memory of their own. A frame renders one view at a time. The next one may come when the records of the view
 before are gone: after its backward pass, or when its result was dropped. Other views are launched one by one meanwhile.
 
+A frame also does what a view needs once: it sends the number of pairs to the processor, and zeroes the memory that the
+backward pass adds gradients to.
+
 A frame has room for more Gaussians and pairs than there are, so that densification seldom needs other graphs.
 """
 
@@ -18,17 +21,14 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from lapgs_plugin.gpu_raster.records import RECORD, grid_of
+from lapgs_plugin.gpu_raster.late_number import LateNumber, new_slot
+from lapgs_plugin.gpu_raster.records import GRADIENT, MOST_OTHERS, RECORD, grid_of, state_of
 from lapgs_plugin.gpu_raster.rules import Rules
-from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS
+from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS, Blending, Tiles, blend_and_sum
 
 T = TypeVar("T")
 Destination = tuple[Tensor, Tensor, Tensor, Tensor]
 """Radii, centres, depths and records that projection writes, as in `records.Projected`."""
-Tiles = tuple[Tensor, Tensor]
-"""Offsets and Gaussians of pairs, as `blend_kernels.blend_family` takes them."""
-Blending = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Results of `blend_kernels.blend_family`."""
 
 ENABLED = True
 """Whether views are replayed at all."""
@@ -45,7 +45,7 @@ HEADROOM = 1.25
 MOST_ROOM = 2.0
 """Room for Gaussians or pairs, by what is wanted, from which on less is reserved."""
 
-_Kind = tuple[torch.device, int, tuple[int, int], Rules, float]
+_Kind = tuple[torch.device, int, tuple[int, int], Rules, float, bool]
 _lock = threading.Lock()
 _broken: list[object] = []  # recordings that failed, which PyTorch may still refer to
 
@@ -89,7 +89,7 @@ _frames = _Frames()
 
 
 def take_frame(
-    like: Tensor, n: int, size: tuple[int, int], rules: Rules, mult: float
+    like: Tensor, n: int, size: tuple[int, int], rules: Rules, mult: float, summed: bool, stream: int
 ) -> tuple[Frame, Destination] | None:
     """Return a frame for n Gaussians that nothing else uses, and where to project them.
 
@@ -97,6 +97,8 @@ def take_frame(
         like: a tensor of the Gaussians.
         size: (width, height).
         rules, mult: as `blend_kernels.blend_family` takes them.
+        summed: whether sums over pixels are wanted.
+        stream: the current one's number.
 
     Returns:
         None if the view has to be launched without a frame.
@@ -108,7 +110,7 @@ def take_frame(
         return None
     if torch.is_inference_mode_enabled():  # memory that was reserved then could not be saved for a backward pass
         return None
-    kind = device, torch.cuda.current_stream(device).cuda_stream, size, rules, mult
+    kind = device, stream, size, rules, mult, summed
     with _lock:
         frame = _frames.get(kind, n, like)
         into = None if frame is None else frame.take(n)
@@ -127,22 +129,30 @@ class Frame:
     Args:
         like: a tensor of the Gaussians.
         room: number of Gaussians that there is room for.
-        size, rules, mult: as `take_frame` takes them.
+        size, rules, mult, summed: as `take_frame` takes them.
+
+    Attributes:
+        by_records: zeros for one backward pass of the view, as `blend_kernels.blend_backward` takes them.
     """
 
-    def __init__(self, like: Tensor, room: int, size: tuple[int, int], rules: Rules, mult: float) -> None:
+    def __init__(self, like: Tensor, room: int, size: tuple[int, int], rules: Rules, mult: float, summed: bool) -> None:
         self.room = room
-        self._size, self._rules, self._mult = size, rules, mult
+        self._size, self._rules, self._mult, self._summed = size, rules, mult, summed
         self._radii = like.new_zeros(1, room, 2, dtype=torch.int32)
         self._means2d = like.new_empty(1, 0, 2)  # which the family's footprints do without
         self._depths = like.new_zeros(1, room)
         self._records = like.new_empty(1, room, RECORD)
+        self.by_records = like.new_empty(room * (GRADIENT + MOST_OTHERS))
         self._background = like.new_empty(3)
+        self._copied_background: tuple[weakref.ref[Tensor], tuple[int, int]] | None = None  # and its state
         self._n = 0
+        self._of_view = self._slices()
         self._user: weakref.ref[Tensor] | None = None
+        self._stream = torch.cuda.current_stream(like.device)
+        self._pairs_there, self._counted = new_slot(torch.int64)
         self._recorder = _Recorder(like.device)
         self._sorting: _Recording[Tiles] | None = None
-        self._blending: _Recording[tuple[Tiles, Blending]] | None = None
+        self._blending: _Recording[tuple[Tiles, Blending, Tensor | None]] | None = None
         self._pairs = 0
 
     def take(self, n: int) -> Destination | None:
@@ -151,39 +161,59 @@ class Frame:
             return None
         if n < self._n:
             self._radii.zero_()  # those that are not there any more are in no tile
-        self._n = n
+        if n != self._n:
+            self._n = n
+            self._of_view = self._slices()
         records = self._records[:, :n]  # whoever reads this view's memory holds them, too
         self._user = weakref.ref(records)
-        return self._radii[:, :n], self._means2d, self._depths[:, :n], records
+        return *self._of_view, records
 
-    def sort(self) -> Tensor:
-        """Sort Gaussians by depth; return the number of pairs, on the device."""
+    def _slices(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return radii, centres and depths of the view's Gaussians."""
+        return self._radii[:, : self._n], self._means2d, self._depths[:, : self._n]
+
+    def sort(self) -> LateNumber:
+        """Sort Gaussians by depth; return the number of pairs, to be read before the next view is rendered."""
         if self._sorting is None:
             self._sorting = self._recorder.record(self._sort)
-        return self._sorting.replay()[1][-1]
+        self._sorting.replay()
+        self._counted.record(self._stream)
+        return LateNumber(self._pairs_there, self._counted)
 
-    def blend(self, background: Tensor, pairs: int) -> tuple[Tiles, Blending]:
-        """Sort pairs by tile and blend them; there is room for as many pairs or more."""
-        self._background.copy_(background)
+    def blend(self, background: Tensor, pairs: int) -> tuple[Tiles, Blending, Tensor | None]:
+        """Sort pairs by tile and blend them, see `tiles.blend_and_sum`; there is room for as many pairs or more."""
+        self._set_background(background)
         if self._blending is None or not pairs <= self._pairs <= MOST_ROOM * pairs:
             self._blending, self._pairs = None, min(int(HEADROOM * pairs), MOST_PAIRS)  # its memory is needed
             self._blending = self._recorder.record(self._sort_and_blend)
         return self._blending.replay()
 
+    def _set_background(self, background: Tensor) -> None:
+        """Copy a background, unless it is the one of the view before."""
+        before = self._copied_background
+        if before is None or before[0]() is not background or before[1] != state_of(background):
+            self._background.copy_(background)
+            tracked = not background.is_inference()
+            self._copied_background = (weakref.ref(background), state_of(background)) if tracked else None
+
     def _sort(self) -> Tiles:
         from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth
 
-        return sort_by_depth(self._radii, self._means2d, self._depths, grid_of(self._size), True)
+        order, ends = sort_by_depth(self._radii, self._means2d, self._depths, grid_of(self._size), True)
+        self._pairs_there.copy_(ends[-1], non_blocking=True)
+        return order, ends
 
-    def _sort_and_blend(self) -> tuple[Tiles, Blending]:
-        from lapgs_plugin.gpu_raster.blend_kernels import blend_family
+    def _sort_and_blend(self) -> tuple[Tiles, Blending, Tensor | None]:
         from lapgs_plugin.gpu_raster.tile_kernels import sort_by_tile
 
         assert self._sorting is not None
         order, ends = self._sorting.results
         grid = grid_of(self._size)
         tiles = sort_by_tile(self._radii, self._means2d, order, ends, None, 1, grid, self._pairs, True)
-        return tiles, blend_family(self._records, self._background, *tiles, self._size, self._rules, self._mult)
+        self.by_records.zero_()
+        return tiles, *blend_and_sum(
+            self._records, self._background, tiles, self._size, self._rules, self._mult, self._summed
+        )
 
 
 class _Recording(Generic[T]):

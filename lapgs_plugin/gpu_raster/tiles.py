@@ -15,18 +15,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError
 from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
-from lapgs_plugin.gpu_raster.records import Projected, grid_of
+from lapgs_plugin.gpu_raster.late_number import LateNumber
+from lapgs_plugin.gpu_raster.records import Blended, Projected, grid_of
 from lapgs_plugin.gpu_raster.rules import Rules
 
 if TYPE_CHECKING:
     from lapgs_plugin.gpu_raster.replay import Frame
 
 T = TypeVar("T")
+Tiles = tuple[Tensor, Tensor]
+"""Offsets and Gaussians of pairs, as `blend_kernels.blend_family` takes them."""
+Blending = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Results of `blend_kernels.blend_family`."""
 
 MARGIN = 1.125
 """Room for pairs, by their number in the last renders."""
@@ -86,22 +90,25 @@ def blend_family_in_tiles(
     size: tuple[int, int],
     rules: Rules,
     mult: float,
+    summed: bool,
     frame: Frame | None = None,
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor], Pairs]:
+) -> tuple[Tiles, Blending, Tensor | None, Pairs]:
     """Sort Gaussians of one camera into tiles, front to back, and blend them by the family's rules.
 
     Args:
-        background, size, rules, mult: as `blend_family` takes them.
+        background: (3,) on any device.
+        size, rules, mult: as `blend_family` takes them.
+        summed: whether to return sums over pixels.
         frame: that they were projected to.
 
     Returns:
-        Offsets and Gaussians of pairs as `blend_family` takes them, its results, and the pairs. If these do not fit,
-        all has to be made again.
+        Offsets and Gaussians of pairs as `blend_family` takes them, its results, sums as `sums_over_pixels` returns
+        them but for those of weights, of at least as many Gaussians, and the pairs. If these do not fit, all has to be
+        made again.
 
     Raises:
         DeviceMemoryError: there are 2**31 pairs or more.
     """
-    from lapgs_plugin.gpu_raster.blend_kernels import blend_family
     from lapgs_plugin.gpu_raster.tile_kernels import sort_by_depth, sort_by_tile
 
     radii, means2d, depths, records = projected[:4]
@@ -111,20 +118,36 @@ def blend_family_in_tiles(
         return *frame.blend(background, pairs.room), pairs
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid, True)
-    pairs = Pairs(key, ends[-1])
+    pairs = Pairs(key, LateNumber.of(ends[-1]))
     tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, pairs.room, True)
-    return tiles, blend_family(records, background, *tiles, size, rules, mult), pairs
+    background = background.to(records).contiguous()
+    return tiles, *blend_and_sum(records, background, tiles, size, rules, mult, summed), pairs
+
+
+def blend_and_sum(
+    records: Tensor, background: Tensor, tiles: Tiles, size: tuple[int, int], rules: Rules, mult: float, summed: bool
+) -> tuple[Blending, Tensor | None]:
+    """Return the results of `blend_family`, and if `summed` sums over pixels, those of weights without meaning."""
+    from lapgs_plugin.gpu_raster.blend_kernels import blend_family
+    from lapgs_plugin.gpu_raster.sum_kernels import sums_over_pixels
+
+    blending = blend_family(records, background, *tiles, size, rules, mult)
+    if not summed:
+        return blending, None
+    image, _, counts, words = blending
+    return blending, sums_over_pixels(Blended(records, *tiles, image, counts, words), image)
 
 
 def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]) -> T:
     """Return what an attempt with enough room makes.
 
     Args:
-        key, number: as `Pairs` takes them.
+        key: as `Pairs` takes it.
+        number: of pairs, on the device.
         attempt: launches what has room for as many pairs.
     """
     while True:
-        pairs = Pairs(key, number)
+        pairs = Pairs(key, LateNumber.of(number))
         result = attempt(pairs.room)
         if pairs.fit():
             return result
@@ -136,7 +159,7 @@ class Pairs:
 
     Args:
         key: of renders that have about as many.
-        number: of pairs, on the device.
+        number: of pairs.
 
     Attributes:
         room: for pairs.
@@ -145,8 +168,8 @@ class Pairs:
         DeviceMemoryError: there are 2**31 pairs or more.
     """
 
-    def __init__(self, key: tuple[Any, ...], number: Tensor) -> None:
-        self._key, self._number = key, _LateNumber(number)
+    def __init__(self, key: tuple[Any, ...], number: LateNumber) -> None:
+        self._key, self._number = key, number
         self.room = _rounded(_rooms[key] if key in _rooms else MARGIN * self._number.read())
 
     def fit(self) -> bool:
@@ -165,39 +188,3 @@ def _rounded(pairs: float) -> int:
         )
     step = max(LEAST_ROOM, 1 << max(int(pairs).bit_length() - 5, 0))
     return min(max(-(-int(pairs) // step), 1) * step, MOST_PAIRS)
-
-
-_Slot = tuple[Tensor, torch.cuda.Event]
-_free_slots: dict[torch.device, list[_Slot]] = {}  # each takes the processor longer to make than to use
-
-
-class _LateNumber:
-    """Copy a number from a device to page-locked memory, to be read when the device has arrived there."""
-
-    def __init__(self, number: Tensor) -> None:
-        self._value: int | None = None
-        self._number, self._slot = number, None
-        if number.is_cuda:
-            free = _free_slots.setdefault(number.device, [])
-            self._slot = free.pop() if free else _new_slot(number)
-            copy, copied = self._slot
-            copy.copy_(number, non_blocking=True)
-            copied.record(torch.cuda.current_stream(number.device))
-
-    def read(self) -> int:
-        """Return the number; the first time, wait for it."""
-        if self._value is None:
-            if self._slot is None:
-                self._value = int(self._number)
-            else:
-                copy, copied = self._slot
-                copied.synchronize()
-                self._value = int(copy)
-                _free_slots[self._number.device].append(self._slot)
-        return self._value
-
-
-def _new_slot(number: Tensor) -> _Slot:
-    """Return page-locked memory for a number, and an event."""
-    with torch.inference_mode(False):  # it is written to in other modes, too
-        return torch.empty_like(number, device="cpu", pin_memory=True), torch.cuda.Event()  # type: ignore[no-untyped-call]  # torch's

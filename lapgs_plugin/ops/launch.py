@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import torch
@@ -56,13 +57,29 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants:
         constants: all others, by name, each always of the same type; and Triton's options. `FUSED` is set.
     """
     device = arguments[0].get_device()  # -1 for a CPU's, where kernels are interpreted
-    if device >= 0 and device != torch.cuda.current_device():
+    if (device > 0 or (device == 0 and _are_several())) and device != torch.cuda.current_device():
         with torch.cuda.device(device):
             launch(kernel, programs, *arguments, **constants)
         return
     if STARTS_DIRECTLY and _start_directly(kernel, device, programs, arguments, constants):
         return
     kernel[programs](*arguments, **constants, **FUSED)
+
+
+def current_stream(device: torch.device) -> int:
+    """Return the number of a device's current stream; 0 for a CPU, where kernels are interpreted."""
+    if device.type == "cpu":
+        return 0
+    if not STARTS_DIRECTLY:
+        return torch.cuda.current_stream(device).cuda_stream
+    number: int = triton.runtime.driver.active.get_current_stream(device.index)  # takes a tenth of the time
+    return number
+
+
+@cache
+def _are_several() -> bool:
+    """Return whether there are several GPUs, so that the current one may be another one than the first."""
+    return torch.cuda.device_count() > 1
 
 
 def _start_directly(

@@ -130,6 +130,7 @@ def check(name, case, options=Options(), modifier=1.0, limit=2e-5, **how):
     camera = case.camera
     weights = torch.randn(4, camera.height, camera.width, generator=torch.Generator().manual_seed(1))
     found = []
+    options = replace(options, positions=True)
     for engine, device in ((cpu, "cpu"), (gpu, DEVICE)):
         inputs = inputs_of(case, device, **how)
         output = engine.rasterize(settings_of(case, device, modifier), inputs, options)
@@ -238,7 +239,7 @@ tiles.LEAST_ROOM = 8
 
 def rendered():
     inputs = inputs_of(small(), DEVICE, columns=4)
-    options = Options(sums=("counts", "blending"), inverse_depth=True)
+    options = Options(sums=("counts", "blending"), inverse_depth=True, positions=True)
     output = gpu.rasterize(settings_of(small(), DEVICE), inputs, options)
     (output.image.square().sum() + output.inverse_depths.sum()).backward()
     outputs = {key: getattr(output, key) for key in ("image", "inverse_depths", "radii", "centres", "depths")}
@@ -256,6 +257,49 @@ for key, value in first.items():
     assert relative(again[key], value) < 1e-6, key  # worst seen 0
 """
 
+CHANGED_MATRICES = """
+case, other = small(0, width=17, height=9), small(0, width=17, height=9)
+other = replace(other, camera=make_camera(17, 9, pose_seed=8, principal_offset=(1.0, 2.0)))
+
+
+def check(name, settings, expected):
+    output = gpu.rasterize(settings, inputs_of(case, DEVICE), Options())
+    assert torch.equal(output.image, expected.image), name
+    assert torch.equal(output.radii, expected.radii), name
+
+
+first, second = settings_of(case, DEVICE), settings_of(other, DEVICE)
+expected = [gpu.rasterize(settings_of(each, DEVICE), inputs_of(case, DEVICE), Options()) for each in (case, other)]
+assert not torch.equal(expected[0].image, expected[1].image)
+check("first", first, expected[0])
+check("second", second, expected[1])
+check("first again", first, expected[0])
+for name in ("viewmatrix", "projmatrix", "campos"):
+    getattr(first, name).copy_(getattr(second, name))
+check("changed in place", first, expected[1])
+for name in ("viewmatrix", "projmatrix", "campos"):
+    getattr(first, name).data = getattr(settings_of(case, DEVICE), name)
+check("other memory", first, expected[0])
+for name in ("viewmatrix", "projmatrix", "campos"):
+    setattr(second, name, getattr(settings_of(case, DEVICE), name))
+check("other tensors", second, expected[0])
+second.tanfovx = 1.1 * second.tanfovx
+output = gpu.rasterize(second, inputs_of(case, DEVICE), Options())
+assert not torch.equal(output.image, expected[0].image), "another field of view"
+second.tanfovx = settings_of(case, DEVICE).tanfovx
+with torch.inference_mode():
+    for k, each in enumerate((case, other)):  # such tensors have no versions
+        check("inference", settings_of(each, DEVICE), expected[k])
+check("after inference", second, expected[0])
+second.bg.mul_(2.0)
+assert not torch.equal(gpu.rasterize(second, inputs_of(case, DEVICE), Options()).image, expected[0].image)
+# Cameras go when their matrices do.
+kept = len(gpu._cameras._made)
+assert kept > 0
+del first, second
+assert len(gpu._cameras._made) == 0, kept
+"""
+
 REPLAYED = """
 import gc
 import weakref
@@ -269,10 +313,13 @@ def of(n):
     return replace(whole, field=whole.field.with_parameters({k: v[:n] for k, v in whole.field.parameters.items()}))
 
 
-def render(case, replayed):
+EVERYTHING = Options(sums=("counts",), inverse_depth=True, positions=True)
+
+
+def render(case, replayed, options=EVERYTHING, settings=None):
     replay.ENABLED = replayed
     inputs = inputs_of(case, DEVICE, columns=4)
-    return inputs, gpu.rasterize(settings_of(case, DEVICE), inputs, Options(sums=("counts",), inverse_depth=True))
+    return inputs, gpu.rasterize(settings or settings_of(case, DEVICE), inputs, options)
 
 
 def differentiate(view, **how):
@@ -280,14 +327,18 @@ def differentiate(view, **how):
     for value in inputs:
         if value is not None:
             value.grad = None
-    (output.image.square().sum() + output.inverse_depths.sum()).backward(**how)
+    loss = output.image.square().sum()
+    (loss if output.inverse_depths is None else loss + output.inverse_depths.sum()).backward(**how)
     return view
 
 
 def check(name, view, expected):
     for key in ("image", "inverse_depths", "radii", "centres", "depths"):
-        assert torch.equal(getattr(view[1], key), getattr(expected[1], key)), (name, key)
-    assert torch.equal(view[1].sum("counts"), expected[1].sum("counts")), name
+        one, other = getattr(view[1], key), getattr(expected[1], key)
+        assert one is other is None or torch.equal(one, other), (name, key)
+    if other := expected[1].contributions:
+        for key, value in vars(other).items():
+            assert value is None or relative(view[1].sum(key), value.cpu()) < 1e-5, (name, key)
     by = gradients(view[0])
     for key, value in gradients(expected[0]).items():
         assert relative(by[key], value) < 1e-5, (name, key)  # sums over pixels have no order
@@ -312,14 +363,49 @@ for key in tiles._rooms:
 check("little room", differentiate(render(whole, True)), expected[20_000])
 assert len(replay._frames._by_kind) == 1
 assert not replay._broken, replay._broken
+# Views of other sizes and with other outputs in between, whose results are held.
+replay.MOST_FRAMES = 4
+half = random_case(20_000, 80, 45, seed=6, sh_degree=1, background=COLORED, pixels=(0.5, 6.0)).to(torch.float32)
+shares = Options(sums=("blending",))
+weighted = Options(sums=("weights", "counts"), pixel_weights=torch.rand(160 * 90, device=DEVICE))
+kinds = {"whole": (whole, EVERYTHING), "half": (half, EVERYTHING), "bare": (whole, Options())}
+kinds |= {"shares": (whole, shares), "weighted": (whole, weighted)}
+plain = {name: differentiate(render(case, False, options)) for name, (case, options) in kinds.items()}
+for name, (case, options) in kinds.items():
+    for i in range(replay.REPEATED):
+        check(f"{name} alone {i}", differentiate(render(case, True, options)), plain[name])
+for i in range(3):
+    views = {name: render(case, True, options) for name, (case, options) in kinds.items()}
+    for name, view in views.items():
+        check(f"{name} {i}", differentiate(view), plain[name])
+assert len(replay._frames._by_kind) == 4  # weights are added up elsewhere, in the frame of bare images
+# A background that changes, in place or not, and views without gradients.
+settings = settings_of(whole, DEVICE)
+for name in ("first", "again", "in place", "another", "inference", "after inference"):
+    if name == "in place":
+        settings.bg.mul_(0.5)
+    if name == "another":
+        settings.bg = settings.bg.flip(0)
+    if name == "inference":
+        with torch.inference_mode():
+            settings.bg = settings.bg + 0.25
+            _, seen = render(whole, True, EVERYTHING, settings)
+            assert torch.equal(seen.image, render(whole, False, EVERYTHING, settings)[1].image)
+    expected_view = differentiate(render(whole, False, EVERYTHING, settings))
+    with torch.no_grad():
+        unused = render(whole, True, EVERYTHING, settings)
+    check(name, differentiate(render(whole, True, EVERYTHING, settings)), expected_view)
+    assert torch.equal(unused[1].image, expected_view[1].image), name
+assert not replay._broken, replay._broken
 # A frame that another one replaces gives its memory back at once, not when Python looks for cycles.
 gc.disable()
 replay.MOST_ROOM = 1.1
-replaced = [weakref.ref(frame) for frame in replay._frames._by_kind.values()]
+kind, = (kind for kind, frame in replay._frames._by_kind.items() if kind[2] == (160, 90) and kind[3].depth)
+replaced = weakref.ref(replay._frames._by_kind[kind])
 for i in range(replay.REPEATED + 1):
     check("other frame", differentiate(render(of(17_000), True)), expected[17_000])
-assert len(replay._frames._by_kind) == 1
-assert [frame() for frame in replaced] == [None]
+assert kind in replay._frames._by_kind
+assert replaced() is None
 """
 
 needs_triton = pytest.mark.skipif(
@@ -351,7 +437,9 @@ def test_sums_over_pixels_interpreted_against_the_engine_of_the_cpu() -> None:
 @pytest.mark.gpu
 @needs_cuda
 def test_compiled() -> None:
-    run_checks("cuda", f"NAMES = []\n{COMMON}{LIMITS}{PLAIN}{OPTIONS}{SUMS_OVER_PIXELS}{CHANGED_IN_PLACE}")
+    run_checks(
+        "cuda", f"NAMES = []\n{COMMON}{LIMITS}{PLAIN}{OPTIONS}{SUMS_OVER_PIXELS}{CHANGED_IN_PLACE}{CHANGED_MATRICES}"
+    )
 
 
 @pytest.mark.gpu
@@ -363,6 +451,11 @@ def test_views_by_graphs_equal_those_without() -> None:
 @needs_triton
 def test_views_for_which_there_was_too_little_room_are_rendered_again() -> None:
     run_checks("cpu", COMMON + LITTLE_ROOM, TRITON_INTERPRET="1")
+
+
+@needs_triton
+def test_matrices_may_be_changed_in_place() -> None:
+    run_checks("cpu", COMMON + CHANGED_MATRICES, TRITON_INTERPRET="1")
 
 
 @needs_triton
