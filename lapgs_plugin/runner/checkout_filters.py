@@ -72,8 +72,10 @@ def _property(model: type, original: property, ours: Callable[[Any], Tensor]) ->
 
     @wraps(getter)
     def read(gaussians: Any) -> Any:
-        suits = _fits(gaussians) and _has_kernels(gaussians._scaling) and agrees(gaussians._scaling.device)
-        return ours(gaussians) if suits else getter(gaussians)
+        # Resets of opacities divide by the share that filters leave: a quotient above 1 has no logit. So without
+        # gradients, as there, all bits are the checkout's.
+        suits = torch.is_grad_enabled() and _fits(gaussians) and _has_kernels(gaussians._scaling)
+        return ours(gaussians) if suits and agrees(gaussians._scaling.device) else getter(gaussians)
 
     return property(read, original.fset, original.fdel, original.__doc__)
 

@@ -132,6 +132,20 @@ def test_ours_do_the_same(
     assert all(isinstance(value, property) for value in properties)
 
 
+def test_without_gradients_they_are_its_own(load_module: Callable[[str], ModuleType], on_gpu: list[str]) -> None:
+    """As in resets of opacities, which divide by the share that filters leave: above 1, no logit gives a quotient."""
+    module = load_module(MODEL)
+    model = _model(module)
+    with Attachment(checkout_filters.replacements(module.Model, "the test")):
+        assert model.get_opacity_with_3D_filter.requires_grad
+        module.CALLS.clear()
+        on_gpu.clear()
+        with torch.no_grad():
+            model.get_opacity_with_3D_filter, model.get_scaling_with_3D_filter  # noqa: B018  # properties
+    assert module.CALLS == ["opacities", "scales"]
+    assert on_gpu == []
+
+
 def test_one_filter_for_all(load_module: Callable[[str], ModuleType], on_gpu: list[str]) -> None:
     """As models of archived fields have it, whose filters are in their scales."""
     module = load_module(MODEL)
