@@ -335,8 +335,7 @@ class Profile:
     def _with_locals(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return arguments of the training function with the local variables that it sets plainly before its loop."""
         names = dict(values)
-        for statement in plain_assignments(self.source.training):
-            code = compile(ast.Module([statement], []), str(self.script.path), "exec", dont_inherit=True)
+        for code in _compiled_assignments(self.source.training, str(self.script.path)):
             with suppress(Exception):  # it needs something that exists in the loop only
                 exec(code, vars(self.script.module), names)
         return names
@@ -377,7 +376,9 @@ def _records_no_gradients(node: ast.AST) -> bool:
     return any(called_name(call) == "no_grad" for call in calls)
 
 
-# Asked for in every iteration of joint training:
+# All of these are asked for in every iteration of joint training.
+
+
 @lru_cache(maxsize=256)
 def _words(name: str) -> frozenset[str]:
     """Return the words that a name consists of."""
@@ -387,6 +388,13 @@ def _words(name: str) -> frozenset[str]:
 @lru_cache(maxsize=64)
 def _compiled(expression: ast.expr, path: str) -> CodeType:
     return compile(ast.Expression(expression), path, "eval", dont_inherit=True)
+
+
+@lru_cache(maxsize=64)
+def _compiled_assignments(function: ast.FunctionDef, path: str) -> list[CodeType]:
+    """Return the code of each statement of `plain_assignments`."""
+    statements = plain_assignments(function)
+    return [compile(ast.Module([statement], []), path, "exec", dont_inherit=True) for statement in statements]
 
 
 @lru_cache(maxsize=64)
