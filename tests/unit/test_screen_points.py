@@ -5,12 +5,12 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from lapgs_plugin.checkouts.rewriting import Change
 from lapgs_plugin.checkouts.screen_points import ScreenPoints, SettingsZeros
 from lapgs_plugin.rasterizers.signed_color import ColorPath
 from lapgs_plugin.runner.rasterizer_wrapper import RasterizerWrapper
@@ -92,6 +92,14 @@ def test_fields_that_are_rendered_in_turn_keep_their_own_zeros(load_module: Call
     assert kept[0] != kept[1]
 
 
+def count_changes(change_of: Callable[[ast.FunctionDef], Change], function: str) -> int:
+    (tree,) = ast.parse(function).body
+    assert isinstance(tree, ast.FunctionDef)
+    change = change_of(tree)
+    change.visit(tree)
+    return change.changes
+
+
 @pytest.mark.parametrize(
     ("lines", "changes"),
     [
@@ -108,10 +116,7 @@ def test_fields_that_are_rendered_in_turn_keep_their_own_zeros(load_module: Call
     ],
 )
 def test_what_is_replaced(lines: str, changes: int) -> None:
-    tree: Any = ast.parse(f"def render(m):\n    {lines}").body[0]
-    change = ScreenPoints(tree)
-    change.visit(tree)
-    assert change.changes == changes
+    assert count_changes(ScreenPoints, f"def render(m):\n    {lines}") == changes
 
 
 @pytest.mark.parametrize(
@@ -133,10 +138,7 @@ def test_what_is_replaced(lines: str, changes: int) -> None:
     ],
 )
 def test_which_settings_are_kept(lines: str, changes: int) -> None:
-    tree: Any = ast.parse(f"def render(x=None):\n    {lines}").body[0]
-    change = SettingsZeros(tree)
-    change.visit(tree)
-    assert change.changes == changes
+    assert count_changes(SettingsZeros, f"def render(x=None):\n    {lines}") == changes
 
 
 def test_zeros_of_settings_are_kept_for_our_rasterizer_alone(
