@@ -17,7 +17,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lapgs_plugin.ops.launch import blocks, launch, rows_of_program
+from lapgs_plugin.ops.launch import blocks, current_stream, launch, rows_of_program
 from lapgs_plugin.ops.mixed_sizes import Sizes, sizes_on_device
 from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_WINDOW
 
@@ -296,8 +296,7 @@ def _empty_maps(prediction: Tensor) -> Tensor:
 
 def _two_zeros(device: torch.device) -> tuple[Tensor, Tensor]:
     """Return two new scalars 0 of the current stream; many are filled in one launch."""
-    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
-    pairs = _zeros.setdefault((device, stream), [])
+    pairs = _zeros.setdefault((device, current_stream(device)), [])
     if not pairs:
         with torch.inference_mode(False):
             block = torch.zeros(2 * PAIRS, ZERO_STEP, device=device)
