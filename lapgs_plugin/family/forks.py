@@ -20,7 +20,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
 from lapgs_plugin.family.call import Blending, Inputs, Options, Output, ShParts, depths_of
 from lapgs_plugin.family.engine import rasterize
-from lapgs_plugin.gpu_raster.late_number import LateNumber
+from lapgs_plugin.gpu_raster.arriving_number import ArrivingNumber
 from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
 
@@ -184,13 +184,13 @@ class MipSplatting(WholeSh):
         return super()._render(inputs._replace(means2d=four))
 
 
-_arriving: deque[LateNumber] = deque()
+_arriving: deque[ArrivingNumber] = deque()
 """Whether pixels were moved in calls on a GPU, on its way to the processor."""
 
 
 def _require_no_offset(settings: Any) -> None:
     """Refuse pixels that are moved; on a GPU a few calls later, because asking it at once would wait for it."""
-    _arriving.append(LateNumber.of(settings.subpixel_offset.any()))
+    _arriving.append(ArrivingNumber.of(settings.subpixel_offset.any()))
     moved = 0
     while _arriving and _arriving[0].has_arrived():
         moved |= _arriving.popleft().read()

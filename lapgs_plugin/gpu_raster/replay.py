@@ -21,7 +21,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from lapgs_plugin.gpu_raster.late_number import LateNumber, new_slot
+from lapgs_plugin.gpu_raster.arriving_number import ArrivingNumber, new_slot
 from lapgs_plugin.gpu_raster.records import GRADIENT, MOST_OTHERS, RECORD, grid_of, state_of
 from lapgs_plugin.gpu_raster.rules import Rules
 from lapgs_plugin.gpu_raster.tiles import MOST_PAIRS, Blending, Tiles, blend_and_sum
@@ -172,13 +172,13 @@ class Frame:
         """Return radii, centres and depths of the view's Gaussians."""
         return self._radii[:, : self._n], self._means2d, self._depths[:, : self._n]
 
-    def sort(self) -> LateNumber:
+    def sort(self) -> ArrivingNumber:
         """Sort Gaussians by depth; return the number of pairs, to be read before the next view is rendered."""
         if self._sorting is None:
             self._sorting = self._recorder.record(self._sort)
         self._sorting.replay()
         self._counted.record(self._stream)
-        return LateNumber(self._pairs_there, self._counted)
+        return ArrivingNumber(self._pairs_there, self._counted)
 
     def blend(self, background: Tensor, pairs: int) -> tuple[Tiles, Blending, Tensor | None]:
         """Sort pairs by tile and blend them, see `tiles.blend_and_sum`; there is room for as many pairs or more."""

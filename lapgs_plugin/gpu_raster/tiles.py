@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from torch import Tensor
 
 from lapgs_plugin.errors import DeviceMemoryError
+from lapgs_plugin.gpu_raster.arriving_number import ArrivingNumber
 from lapgs_plugin.gpu_raster.bindings import compiled_functions, sort_by_gsplat
-from lapgs_plugin.gpu_raster.late_number import LateNumber
 from lapgs_plugin.gpu_raster.records import Blended, Projected, grid_of
 from lapgs_plugin.gpu_raster.rules import Rules
 
@@ -118,7 +118,7 @@ def blend_family_in_tiles(
         return *frame.blend(background, pairs.room), pairs
     grid = grid_of(size)
     order, ends = sort_by_depth(radii, means2d, depths, grid, True)
-    pairs = Pairs(key, LateNumber.of(ends[-1]))
+    pairs = Pairs(key, ArrivingNumber.of(ends[-1]))
     tiles = sort_by_tile(radii, means2d, order, ends, None, 1, grid, pairs.room, True)
     background = background.to(records).contiguous()
     return tiles, *blend_and_sum(records, background, tiles, size, rules, mult, summed), pairs
@@ -147,7 +147,7 @@ def _with_room(key: tuple[Any, ...], number: Tensor, attempt: Callable[[int], T]
         attempt: launches what has room for as many pairs.
     """
     while True:
-        pairs = Pairs(key, LateNumber.of(number))
+        pairs = Pairs(key, ArrivingNumber.of(number))
         result = attempt(pairs.room)
         if pairs.fit():
             return result
@@ -168,7 +168,7 @@ class Pairs:
         DeviceMemoryError: there are 2**31 pairs or more.
     """
 
-    def __init__(self, key: tuple[Any, ...], number: LateNumber) -> None:
+    def __init__(self, key: tuple[Any, ...], number: ArrivingNumber) -> None:
         self._key, self._number = key, number
         self.room = _rounded(_rooms[key] if key in _rooms else MARGIN * self._number.read())
 

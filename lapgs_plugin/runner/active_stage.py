@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.errors import (
@@ -24,6 +23,7 @@ from lapgs_plugin.errors import (
 )
 from lapgs_plugin.evaluation.metrics import means
 from lapgs_plugin.fields.gaussian_field import GaussianField, require_finite
+from lapgs_plugin.gpu_raster.arriving_number import ArrivingNumber
 from lapgs_plugin.hierarchy.pruning import unpruned_line
 from lapgs_plugin.runner.context import FinishedStage, StageResult, TrainingRun
 from lapgs_plugin.runner.joint import JointModels
@@ -82,7 +82,8 @@ class ActiveStage(RunningStage):
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         self.returned: Any = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
-        self._asked: _Finiteness | None = None  # about the positions after an earlier iteration
+        # Whether positions were finite after an iteration, on its way from the device: the loop runs ahead of it.
+        self._asked: tuple[int, ArrivingNumber] | None = None
 
     @contextmanager
     def entered(self) -> Iterator[None]:
@@ -288,18 +289,19 @@ class ActiveStage(RunningStage):
         """Ask the device whether positions are finite; `_note_divergence` reads its answer when it is there."""
         self._note_divergence()
         if self._diverged_at is None:
-            self._asked = _Finiteness(gaussians._xyz, iteration)
+            finite = (0 * gaussians._xyz.detach()).sum() == 0  # 0 times NaN or inf is NaN
+            self._asked = iteration, ArrivingNumber.of(finite)
 
     def _note_divergence(self) -> None:
         """Warn once if positions were not finite. Training goes on: some checkouts prune such Gaussians."""
         asked, self._asked = self._asked, None
-        if asked is None or asked.read():
+        if asked is None or asked[1].read():
             return
-        self._diverged_at = asked.iteration
+        self._diverged_at = asked[0]
         logger.warning(
             "level %d has positions of NaN or inf after iteration %d; while it has, it cannot be archived",
             self.stage.level,
-            asked.iteration,
+            self._diverged_at,
         )
 
     def _require_finite(self, fields: Mapping[int, GaussianField]) -> None:
@@ -390,28 +392,3 @@ class ActiveStage(RunningStage):
             with self.record.overhead.timed("cache"):
                 predictions = self._views.predict(gaussians)
         return StageResult(field, predictions, carried, moments)
-
-
-class _Finiteness:
-    """Ask a device whether positions are finite, without waiting for it: the loop runs ahead of it.
-
-    Args:
-        positions: (n, 3).
-        iteration: after which they are these.
-
-    Attributes:
-        iteration: as given.
-    """
-
-    def __init__(self, positions: Tensor, iteration: int) -> None:
-        self.iteration = iteration
-        self._zero = (0 * positions.detach()).sum().to("cpu", non_blocking=True)  # NaN if one is not finite
-        self._copied = torch.cuda.Event() if positions.is_cuda else None  # type: ignore[no-untyped-call]  # torch's
-        if self._copied is not None:
-            self._copied.record(torch.cuda.current_stream(positions.device))
-
-    def read(self) -> bool:
-        """Return whether they are, once the device has arrived there."""
-        if self._copied is not None:
-            self._copied.synchronize()
-        return float(self._zero) == 0.0

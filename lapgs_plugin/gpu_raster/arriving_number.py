@@ -11,7 +11,7 @@ Slot = tuple[Tensor, torch.cuda.Event]
 _free_slots: dict[tuple[torch.device, torch.dtype], list[Slot]] = {}
 
 
-class LateNumber:
+class ArrivingNumber:
     """Read a number that a device copies to page-locked memory, when the device has arrived there.
 
     Args:
@@ -25,7 +25,7 @@ class LateNumber:
         self._copy, self._copied, self._free = copy, copied, free
 
     @classmethod
-    def of(cls, number: Tensor) -> LateNumber:
+    def of(cls, number: Tensor) -> ArrivingNumber:
         """Copy a number, if it is on a device."""
         if not number.is_cuda:
             return cls(number, None)
