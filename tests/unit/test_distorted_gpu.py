@@ -47,7 +47,7 @@ def gaussians(degree: int, signed: bool, count: int = 3000) -> GaussianField:
 
 def rendered(rasterizer: Rasterizer, field: GaussianField, camera: Camera, device: str) -> tuple[Tensor, list[Tensor]]:
     """The image, and the gradients of a weighted sum of it by the field's parameters and centres, on the CPU."""
-    leaves = {name: value.to(device).requires_grad_() for name, value in field.parameters.items()}
+    leaves = {name: value.detach().to(device, copy=True).requires_grad_() for name, value in field.parameters.items()}
     background = torch.zeros(3) if field.signed else torch.tensor([0.1, 0.2, 0.3])
     weights = torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(5)).to(device)
     result = rasterizer(field.with_parameters(leaves), camera, background=background.to(device))
