@@ -117,6 +117,16 @@ class TrainingCall:
         return {**inspect.unwrap(self.function).__globals__, **self.values}
 
     @property
+    def _parsed(self) -> list[Namespace]:
+        """The script's parsed options: those that the function sees as globals, and arguments."""
+        variables = getattr(inspect.unwrap(self.function), "__globals__", {})
+        return [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
+
+    def having(self, option: str) -> list[Any]:
+        """Return the parsed options and the arguments that have an option."""
+        return [group for group in (*self._parsed, *self.values.values()) if hasattr(group, option)]
+
+    @property
     def white_background(self) -> bool:
         return bool(getattr(self.dataset, "white_background", False))
 
@@ -157,9 +167,7 @@ class TrainingCall:
 
         Some forks read the folder from a global variable, or give all options to their scene.
         """
-        variables = getattr(inspect.unwrap(self.function), "__globals__", {})
-        parsed = [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
-        kept = [(group, group.model_path) for group in parsed if hasattr(group, "model_path")]
+        kept = [(group, group.model_path) for group in self._parsed if hasattr(group, "model_path")]
         folder = getattr(self.dataset, "model_path", None)
         try:
             for group, _ in kept:

@@ -21,6 +21,7 @@ from lapgs_plugin.hierarchy.settings import is_large
 from lapgs_plugin.ops.position_noise import add_noise
 from lapgs_plugin.ops.position_noise.in_torch import displacements
 from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, NEAR_DEPTH
+from lapgs_plugin.stages.opacity_weight import COLORLESS
 from lapgs_plugin.training.densification import DensityControl, ViewScores, add_gradients
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.schedule import StageSchedule
@@ -35,10 +36,6 @@ DEAD_OPACITY = 0.01
 LEAST_OPACITY = 0.005
 """Opacity of copies, at least. Gaussians of a residual that are fainter are removed: these are half of all and more
 where a base needs no correction, and as many copies would undo what others have learned since the last refinement."""
-COLORLESS = 0.02
-"""Share of the iterations up to a residual's last refinement in which the loss has no mean opacity. Gaussians that
-start without colour have no other gradient of their opacities, and Adam's steps are as long for a small one as for a
-large one."""
 STATISTICS_VIEWS = 40
 """Views before each refinement whose gradients say where Gaussians are needed."""
 MOST_COPIES = 51

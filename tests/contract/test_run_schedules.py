@@ -28,6 +28,7 @@ from tests.contract.stub_runs import (
     THIRDS,
     captured,
     drive,
+    edited_graphdeco,
     loaded,
     run_hierarchy,
     run_residuals,
@@ -343,6 +344,25 @@ def test_residuals_reset_opacities_where_that_is_asked_for(scene: Path, tmp_path
         model.training_setup, model.reset_opacity = training_setup, reset_opacity
         drive(adapter, hierarchy="laplacian", residual_resets=True, **THIRDS)
     assert reset == {30, 60}
+
+
+def test_residuals_weigh_the_mean_opacity_less_and_the_option_comes_back(scene: Path, tmp_path: Path) -> None:
+    """A loss reads the weight of the script's parsed options, a global; its main block's are as before afterwards."""
+    loss = "loss = loss + args.opacity_reg * gaussians.get_opacity.mean(); WEIGHTS.append(args.opacity_reg)\n"
+    script = edited_graphdeco(tmp_path / "c", "train.py", "loss.backward()", f"{loss}        loss.backward()")
+    option = 'parser.add_argument("--opacity_reg", type=float, default=0.5)\n    args = parsed(parser)'
+    text = script.read_text(encoding="utf-8").replace("args = parsed(parser)", option)
+    script.write_text(text.replace("\n\ndef training(", "\n\nWEIGHTS = []\n\n\ndef training(", 1), encoding="utf-8")
+    more = ("--densify_until_iter", 75)
+    with (
+        captured(tmp_path, []),
+        loaded(STUBS["graphdeco"], scene, tmp_path / "run", *more, script=script) as adapter,
+    ):
+        drive(adapter, hierarchy="laplacian", **THIRDS)
+        module = adapter.train
+    assert module.args.opacity_reg == 0.5
+    assert module.WEIGHTS[:30] == [0.5] * 30
+    assert module.WEIGHTS[30:] == [0.0] + [0.05] * 59  # none in a fiftieth of 50 iterations
 
 
 def test_taming_says_when_a_stage_is_too_short_for_its_budget(scene: Path, tmp_path: Path) -> None:

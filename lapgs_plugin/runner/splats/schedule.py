@@ -6,15 +6,12 @@ import copy
 from typing import Any
 
 from lapgs_plugin.checkouts.training_call import StageWindow
-from lapgs_plugin.hierarchy.settings import FREE_VIEWS, HierarchySettings
+from lapgs_plugin.hierarchy.settings import HierarchySettings
 
 THRESHOLD = "grow_grad2d"
 """Threshold of gsplat's DefaultStrategy on screen-space gradients."""
 NEVER = 10**9
 """An interval that no run reaches."""
-FREE_SHARE = 0.02
-"""Share of a residual's densification without a weight of mean opacity: it starts without colour, so that nothing holds
-its opacities against the weight."""
 
 
 def stage_config(config: Any, window: StageWindow, result_dir: str, settings: HierarchySettings) -> Any:
@@ -48,16 +45,3 @@ def set_threshold(strategy: Any, of_run: Any, factor: float) -> None:
     """Set a strategy's threshold of densification to that of the run's, times a factor; MCMC has none."""
     if hasattr(of_run, THRESHOLD):
         setattr(strategy, THRESHOLD, getattr(of_run, THRESHOLD) * factor)
-
-
-def opacity_weight(config: Any, iteration: int, of_run: float, views: int) -> float:
-    """Return the weight of mean opacity in a residual's iteration.
-
-    Args:
-        config: settings of its stage.
-        iteration: from 1.
-        of_run: weight that the user chose.
-        views: number of training views.
-    """
-    free = FREE_SHARE * getattr(config.strategy, "refine_stop_iter", config.max_steps)
-    return 0.0 if iteration <= free else of_run * min(1.0, FREE_VIEWS / views)

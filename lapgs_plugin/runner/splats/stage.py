@@ -21,11 +21,11 @@ from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.runner.splats.joint import follow, trainable
 from lapgs_plugin.runner.splats.run import SplatRun, write_cameras
-from lapgs_plugin.runner.splats.schedule import opacity_weight
 from lapgs_plugin.runner.splats.signed import COLORS, CoarserLevels, FinishedField, compose
 from lapgs_plugin.runner.splats.views import SplatView, camera_inputs, level_item, level_pixels
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.stages.images import StageImages
+from lapgs_plugin.stages.opacity_weight import OpacityWeight
 from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
@@ -58,7 +58,9 @@ class SplatStage:
         self._images = StageImages(run, stage, self._sizes, eight_bit=True, masked=masked)
         self._batch: list[str] = []  # views of the running iteration
         self._items: dict[int, dict[str, Any]] = {}  # of views, without pixels
-        self._opacity_weight = float(getattr(self._trainer.cfg, "opacity_reg", 0.0))
+        config = self._trainer.cfg
+        last = getattr(config.strategy, "refine_stop_iter", config.max_steps)
+        self._opacity_weight = OpacityWeight([config] if stage.signed else [], last)
         self.iteration = 0
 
     def begin(self) -> None:
@@ -107,9 +109,8 @@ class SplatStage:
             self._record.write_history(self.iteration - 1, {"elapsed": elapsed, **quality})
         if self.iteration == self._joint_from:
             self._train_jointly()
-        if self.stage.signed and self._opacity_weight > 0:
-            weight = opacity_weight(self._trainer.cfg, self.iteration, self._opacity_weight, len(self._run.train))
-            self._trainer.cfg.opacity_reg = weight
+        if self._opacity_weight:
+            self._opacity_weight.set(self.iteration)
         if self._joint and self._coarser is not None:
             count += sum(len(field.splats["means"]) for field in self._coarser.fields)
         self._record.count(self.iteration, count)
