@@ -38,10 +38,10 @@ than one of its base."""
 LARGE = f"{LARGE_IMAGE / 1e6:g} megapixels"
 RESIDUAL_COLOR_RATE = 4.0
 """Default factor on SH learning rates in residual stages, which start from zero colour and have fewer iterations."""
-FREE_VIEWS = 80
-"""Training views from which on MCMC's residuals have less of the weight of the mean opacity, in proportion to 1 /
-views. They start without colour, so that nothing holds their opacities against it, and lose detail; but few views do
-not show which detail is wrong elsewhere."""
+RESIDUAL_OPACITY = 0.1
+"""Share of the weight of the mean opacity in a loss that residuals keep. The gradient of an opacity by the other losses
+is in proportion to the colour behind it, which is about that share of a picture's; with the whole weight residuals lose
+detail."""
 
 PANEL = "Hierarchy"
 STORAGE = "Memory and speed"

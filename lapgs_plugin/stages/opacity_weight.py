@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from lapgs_plugin.hierarchy.settings import RESIDUAL_OPACITY
+
 OPTION = "opacity_reg"
 """Name of the weight in the options of 3dgs-mcmc and of gsplat's `simple_trainer.py`."""
 
@@ -13,11 +15,6 @@ COLORLESS = 0.02
 """Share of the iterations up to a residual's last refinement in which the loss has no mean opacity. Gaussians that
 start without colour have no other gradient of their opacities, and Adam's steps are as long for a small one as for a
 large one."""
-
-
-RESIDUAL_SHARE = 0.1
-"""Share of the weight that residuals keep. Their colours are about that share of a picture's, and with them what the
-other losses have to say about opacities: with the whole weight they lose detail."""
 
 
 class OpacityWeight:
@@ -39,7 +36,7 @@ class OpacityWeight:
 
     def set(self, iteration: int) -> None:
         """Set the weight of an iteration, from 1."""
-        factor = 0.0 if iteration <= self._colorless else RESIDUAL_SHARE
+        factor = 0.0 if iteration <= self._colorless else RESIDUAL_OPACITY
         for options, weight in self._own:
             setattr(options, OPTION, factor * weight)
 

@@ -207,7 +207,7 @@ class PreparedRun(StagedRun):
     def strategy_of(self, stage: Stage) -> Strategy:
         """Return the strategy of density control with the options of a stage."""
         sizes = [level_size(view.camera.size, stage.level) for view in self.scene.train]
-        return self.settings.strategy_of(stage, len(sizes), sum(map(math.prod, sizes)))
+        return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
 
     def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
         """Return the density control of a stage."""

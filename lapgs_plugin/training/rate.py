@@ -30,7 +30,7 @@ def views_per_second(scene: Scene, settings: TrainSettings, placed: PlacedRaster
     rasterizer, device = in_unit(placed.rasterizer, scene.unit), placed.device
     stage = make_plan(scene.smallest_size, settings)[0]
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    limit = settings.strategy_of(stage, len(scene.train), pixels).most or 0
+    limit = settings.strategy_of(stage, pixels).most or 0
     points = field_from_points(scene.points, scene.colors, settings.sh_degree)
     rows = torch.arange(max(limit, len(points))) % len(points)
     field = points.with_parameters({name: values[rows] for name, values in points.parameters.items()}).to(device)

@@ -472,17 +472,15 @@ class TrainSettings(HierarchySettings):
             raise UserInputError(f"--views-per-step {views}: expected auto, or at least 1")
         return views
 
-    def strategy_of(self, stage: Stage, views: int, pixels: int) -> Strategy:
+    def strategy_of(self, stage: Stage, pixels: int) -> Strategy:
         """Return the strategy of density control with the options of a stage.
 
         Args:
             stage: of this run's plan.
-            views: number of training views.
-            pixels: of their images of the stage's level together.
+            pixels: of all training images of the stage's level together.
         """
         part = StagePart(
             self.threshold_factor(stage),
-            views,
             pixels,
             base=self._is_base(stage.level),
             finest=stage.level == 0,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.hierarchy.settings import AUTO, FREE_VIEWS
+from lapgs_plugin.hierarchy.settings import AUTO, RESIDUAL_OPACITY
 from lapgs_plugin.options import check_values, option, option_name, require_positive
 from lapgs_plugin.registry import Registry
 from lapgs_plugin.untrusted import STRICT
@@ -49,7 +49,6 @@ class StagePart:
 
     Attributes:
         threshold_factor: on densification thresholds.
-        views: number of training views.
         pixels: of all training images of its level together.
         base: whether it is the coarsest of several levels.
         finest: whether it trains at full size.
@@ -57,7 +56,6 @@ class StagePart:
     """
 
     threshold_factor: float = 1.0
-    views: int = 1
     pixels: int = 1
     base: bool = False
     finest: bool = True
@@ -138,7 +136,7 @@ class Regularized(Strategy):
     opacity_regularization: float | None = option(
         None,
         "Weight of the mean opacity in the loss, which makes Gaussians transparent that are not needed. Default: 0.01 "
-        f"with --strategy mcmc, {FREE_VIEWS} / views of that in its residual levels of more training views; else 0. "
+        f"with --strategy mcmc, and {RESIDUAL_OPACITY} times that in its residual levels; else 0. "
         "Residual levels with mcmc leave it out in the first fiftieth of their densification, and multiply it by the "
         "share of their Gaussians that are left.",
         panel=PANEL,
@@ -284,7 +282,7 @@ class Mcmc(Regularized):
         limit = own or max(1, min(most, part.pixels // PIXELS_A_GAUSSIAN))
         weight = self.opacity_regularization
         if weight is None and part.signed:
-            weight = self.default_weight * min(1.0, FREE_VIEWS / part.views)
+            weight = RESIDUAL_OPACITY * self.default_weight
         return replace(self, cap_max=limit, opacity_regularization=weight)
 
     def of_shard(self, shards: int) -> Self:

@@ -45,7 +45,7 @@ OF_OTHERS = {
     "--duplicates",
     # of gsplat's trainer, pip and mkdocs
     "--app_opt", "--data_dir", "--data_factor", "--disable_video", "--max_steps", "--patch_size",
-    "--pose_opt", "--random_bkgd", "--result_dir", "--index-url", "--no-build-isolation",
+    "--opacity_reg", "--pose_opt", "--random_bkgd", "--result_dir", "--index-url", "--no-build-isolation",
     # of nerfstudio, before a point
     "--pipeline",
 }  # fmt: skip

@@ -352,14 +352,14 @@ def test_thresholds_and_limits_of_stages() -> None:
     density = Densification(strategy="multiview")
     settings = TrainSettings(levels=3, hierarchy="laplacian", residual_threshold=1.5, densification=density)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy.LAPLACIAN)
-    strategies: Any = [settings.strategy_of(stage, 10, 10**9) for stage in plan]
+    strategies: Any = [settings.strategy_of(stage, 10**9) for stage in plan]
     assert [one.grow_grad2d for one in strategies] == pytest.approx([2e-4, 3e-4, 3e-4])
     assert [one.split_absgrad2d for one in strategies] == pytest.approx([8e-4, 12e-4, 12e-4])
     mcmc = Densification(strategy="mcmc", options=Mcmc(cap_max=9, base_cap_max=5))
     capped = replace(settings, residual_threshold=1.0, densification=mcmc)
-    assert [capped.strategy_of(stage, 10, 10**9) for stage in plan] == [
+    assert [capped.strategy_of(stage, 10**9) for stage in plan] == [
         Mcmc(opacity_regularization=weight, cap_max=cap, base_cap_max=5)
-        for cap, weight in ((5, None), (9, 0.01), (9, 0.01))
+        for cap, weight in ((5, None), (9, 0.001), (9, 0.001))
     ]
 
 
@@ -475,5 +475,5 @@ def test_a_nested_field_densifies_for_a_third_of_a_long_stage(iterations: int, u
 def test_coarse_levels_densify_less(hierarchy: str, given: float | None, factors: list[int]) -> None:
     settings = heuristics(levels=3, hierarchy=hierarchy, coarse_threshold=given)
     plan = StagePlan.create((1600, 1066), 30_000, 3, hierarchy=Hierarchy(hierarchy))
-    thresholds = [settings.strategy_of(stage, 10, 10**9).grow_grad2d for stage in plan]
+    thresholds = [settings.strategy_of(stage, 10**9).grow_grad2d for stage in plan]
     assert thresholds == pytest.approx([2e-4 * factor for factor in factors])
