@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,8 @@ from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_folder,
 from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.untrusted import require_regular
+
+logger = logging.getLogger(__name__)
 
 POINTS, TRANSFORMS = "points", "transforms"
 """Values of --depth, beside auto, none and a folder."""
@@ -152,7 +155,14 @@ def resolve_depth(scene: Path, setting: str) -> str:
         UserInputError: there is no such folder.
     """
     if setting == AUTO:
-        return _own_depth(scene)
+        own = _own_depth(scene)
+        if own == NONE:
+            logger.warning(
+                "--depth auto: no depth maps in %s, so depth is not supervised; expected a folder depth/, or "
+                "depth_file_path in transforms.json; --depth points takes the points of COLMAP",
+                scene,
+            )
+        return own
     if setting in (NONE, POINTS, TRANSFORMS):
         return setting
     return resolve_folder(scene, setting, "--depth", "a folder of depth maps, points or none")

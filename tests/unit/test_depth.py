@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -180,11 +181,15 @@ def test_only_unusable_maps_are_an_error_of_one_line(scene: Path, write: object,
     assert not (scene / "run").exists()
 
 
-def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path) -> None:
-    assert resolve_depth(scene, "auto") == "none"
+def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert resolve_depth(scene, "auto") == "none"
+    assert f"no depth maps in {scene}, so depth is not supervised" in caplog.text
     assert resolve_depth(scene, "points") == "points"
     (scene / "lowres_depth").mkdir()
+    caplog.clear()
     assert resolve_depth(scene, "auto") == "lowres_depth"
+    assert not caplog.text
     (scene / "depth").mkdir()
     assert resolve_depth(scene, "auto") == "depth"
     (tmp_path / "maps").mkdir()
