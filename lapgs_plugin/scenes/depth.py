@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,8 @@ from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.scene import Scene, View
 from lapgs_plugin.untrusted import require_regular
 
+logger = logging.getLogger(__name__)
+
 POINTS, TRANSFORMS = "points", "transforms"
 """Values of --depth, beside auto, none and a folder."""
 DEPTH_PATHS = "depth_file_path of transforms.json"
@@ -50,6 +53,12 @@ EVEN = 1e-3
 """Standard deviation of a map, over its mean, below which it determines no shift."""
 LEAST_PIXELS = 32
 """Fewest valid pixels of a map that is used."""
+SAME = 0.05
+"""Median deviation of points' inverse depths, over their median, below which a map need not tell them apart."""
+UNLIKE = (0.0, 0.0)
+"""Scale and shift of a map that disagrees with the points."""
+MOST_LEFT = 0.8
+"""Largest share of that deviation which a map that agrees with its points leaves over."""
 INVERSE = -0.2
 """Mean rank correlation of a map's values with the points' depths below which the values are inverse depths."""
 INSIDE_SHARE = 0.5
@@ -146,7 +155,14 @@ def resolve_depth(scene: Path, setting: str) -> str:
         UserInputError: there is no such folder.
     """
     if setting == AUTO:
-        return _own_depth(scene)
+        own = _own_depth(scene)
+        if own == NONE:
+            logger.warning(
+                "--depth auto: no depth maps in %s, so depth is not supervised; expected a folder depth/, or "
+                "depth_file_path in transforms.json; --depth points takes the points of COLMAP",
+                scene,
+            )
+        return own
     if setting in (NONE, POINTS, TRANSFORMS):
         return setting
     return resolve_folder(scene, setting, "--depth", "a folder of depth maps, points or none")
@@ -255,7 +271,14 @@ def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str,
     seen = _seen_points(scene, images)
     is_inverse = _holds_inverse_depth(values, seen)
     maps = {name: value if is_inverse else 1.0 / value for name, value in values.items()}
-    fits = {name: fit for name, each in maps.items() if name in seen and (fit := _fit_to_points(each, seen[name]))}
+    told = {name: fit for name, each in maps.items() if name in seen and (fit := _fit_to_points(each, seen[name]))}
+    fits = {name: fit for name, fit in told.items() if fit != UNLIKE}
+    unlike = [name for name in told if name not in fits]
+    if told and not fits:
+        raise SceneError(
+            f"{where}: none of {counted(len(told), 'depth map')} agrees with the points that its photo sees, "
+            f"expected depths along the optical axis, or inverse depths, of the photos of their names; {MAPS_ADVICE}"
+        )
     if fits:
         how = f"{counted(len(fits), 'scale')} and shifts fitted to the points that the photos see"
     elif where == DEPTH_PATHS:
@@ -268,7 +291,12 @@ def _load_maps(scene: Scene, files: Mapping[str, Path], where: str, images: str,
         )
     kind = "inverse depth" if is_inverse else "depth"
     say(f"depth ({where}): {len(values)} of {len(scene.train)} training photos have a map, read as {kind}; {how}")
-    if few := len(maps) - len(fits):
+    if unlike:
+        say(
+            f"depth: {counted(len(unlike), 'map')} not used, because the points that the photos see disagree; "
+            f"the first: that of {printable(unlike[0])}"
+        )
+    if few := len(maps) - len(told):
         say(f"depth: {counted(few, 'map')} not used, because no more than a few points tell their scale")
     return DepthMaps({name: (scale * maps[name] + shift).clamp_min(0.0) for name, (scale, shift) in fits.items()})
 
@@ -390,10 +418,22 @@ def _holds_inverse_depth(maps: Mapping[str, Tensor], seen: Mapping[str, Tensor])
 
 
 def _fit_to_points(inverse: Tensor, points: Tensor) -> tuple[float, float] | None:
-    """Return the scale and shift that bring inverse depths (h, w) to those of points (k, 3), None if those are few."""
+    """Return the scale and shift that bring inverse depths (h, w) to those of points (k, 3).
+
+    Returns:
+        None if the points are few; `UNLIKE` if the map tells near points from far ones hardly better than chance.
+    """
     shown = _at(inverse, points[:, :2])
-    scale, shift = fit_scale_and_shift(shown, points[:, 2], ~shown.isnan()).tolist()
-    return (scale, shift) if scale > 0.0 else None
+    valid = ~shown.isnan()
+    if int(valid.sum()) < LEAST_FIT:
+        return None
+    scale, shift = fit_scale_and_shift(shown, points[:, 2], valid).tolist()
+    wanted = points[valid, 2]
+    middle = wanted.median()
+    apart = (wanted - middle).abs().median()
+    left = (scale * shown[valid] + shift - wanted).abs().median()
+    agrees = apart <= SAME * middle or left <= MOST_LEFT * apart
+    return (scale, shift) if scale > 0.0 and agrees else UNLIKE
 
 
 def _rank_correlation(one: Tensor, other: Tensor) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -137,6 +138,21 @@ def test_maps_that_cannot_be_used_are_named_and_the_others_are(scene: Path) -> N
     assert "2 of 6 training photos have a map" in lines[1]
 
 
+def test_maps_that_disagree_with_the_points_are_named(scene: Path) -> None:
+    write_maps(scene / "depth", load_scene(scene, progress=False))
+    folder, random = scene / "depth", np.random.default_rng(0)
+    cv2.imwrite(str(folder / "0001.png"), np.full(SIZE[::-1], 65535, np.uint16))
+    cv2.imwrite(str(folder / "0004.png"), random.integers(1000, 9000, SIZE[::-1]).astype(np.uint16))
+    depth, loaded_scene, lines = loaded(scene)
+    assert [*depth.names] == ["0000.png", "0002.png", "0003.png", "0005.png"]
+    assert worst(depth, loaded_scene) < 0.01  # worst seen 0.0019
+    assert lines[1].startswith("depth: 2 maps not used, because the points")
+    assert lines[1].endswith("that of 0001.png")
+    for file in folder.iterdir():
+        cv2.imwrite(str(file), np.full(SIZE[::-1], 65535, np.uint16))
+    refuses(SceneError, "none of 6 depth maps agrees with the points", loaded, scene)
+
+
 @pytest.mark.parametrize(
     ("write", "facts"),
     [
@@ -165,11 +181,15 @@ def test_only_unusable_maps_are_an_error_of_one_line(scene: Path, write: object,
     assert not (scene / "run").exists()
 
 
-def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path) -> None:
-    assert resolve_depth(scene, "auto") == "none"
+def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert resolve_depth(scene, "auto") == "none"
+    assert f"no depth maps in {scene}, so depth is not supervised" in caplog.text
     assert resolve_depth(scene, "points") == "points"
     (scene / "lowres_depth").mkdir()
+    caplog.clear()
     assert resolve_depth(scene, "auto") == "lowres_depth"
+    assert not caplog.text
     (scene / "depth").mkdir()
     assert resolve_depth(scene, "auto") == "depth"
     (tmp_path / "maps").mkdir()
