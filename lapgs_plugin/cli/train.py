@@ -175,7 +175,7 @@ def train(
         context.obj.train(request)
         return
     request = replace(request, ranks=joined(), shard=start.shard)
-    with prepare(request, partial(say, stderr=True)) as run:
+    with request.ranks.explained(), prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
         if leads:
             extended = _write_options(path, run, context)
