@@ -240,7 +240,7 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: Til
     if tiling.tiles is None and not continues:
         return False
     shape = None if tiling.tiles is None else tiling.shape
-    if train_tiles(request, shape, started, tell, only_base=tiling.only_base):
+    if train_tiles(request, shape, started, tell, queue=say if tiling.only_base else None):
         _save_preview(out, scene)
         _say_what_is_next(out)
     return True
