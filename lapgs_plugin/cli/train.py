@@ -7,6 +7,7 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -175,6 +176,8 @@ def train(
         context.obj.train(request)
         return
     request = replace(request, ranks=joined(), shard=start.shard)
+    if request.ranks.size > 1:  # signals end imports at once: rank 0 could not say why another rank failed
+        import_module("lapgs_plugin.training.trainer")
     with request.ranks.explained(), prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
         if leads:

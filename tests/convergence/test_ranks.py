@@ -256,6 +256,29 @@ def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
     assert plys(RunArchive.open(out)) == whole
 
 
+def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene", [f"{number:02d}.png" for number in range(16)])
+    damaged = sorted(scene.rglob("*.png"))[1]  # of rank 1
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+            *("-m", "lapgs_plugin", *map(str, words)),
+        ],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=TIMEOUT,
+    )
+    assert ended.returncode == 1
+    (line,) = (line for line in ended.stdout.splitlines() if line.startswith("lapgs:"))
+    assert damaged.name in line
+    assert "damaged or cut short" in line
+
+
 @pytest.mark.slow
 def test_ranks_whose_command_is_killed_leave_a_checkpoint_and_end(
     scene: Path, whole: list[bytes], tmp_path: Path

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from lapgs_plugin import interrupt
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, first_line
 from lapgs_plugin.stages.view_transforms import Processes
 from lapgs_plugin.training.ranks.shards import tree_sum
@@ -267,8 +268,10 @@ class JoinedRanks(Ranks):
     def explained(self) -> Iterator[None]:
         try:
             yield
-        except RankLostError:
+        except (RankLostError, interrupt.Interrupted):  # the agent ends the other ranks of one that failed
+            interrupt.ignore()
             if self.leads and (failure := self._failure()) is not None:
+                interrupt.withdraw()
                 raise RankLostError(*failure.splitlines()) from None
             raise
         except Exception as error:
