@@ -106,6 +106,17 @@ def advise(advice: str) -> None:
     _process.advice = f"; {advice}"
 
 
+def ignore() -> None:
+    """Ignore signals from now on, because the command ends anyway."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def withdraw() -> None:
+    """Let the error that a command raises next be its end, not the signal: the signal only followed from it."""
+    _process.raised = False
+
+
 def be_silent() -> None:
     """Print no line in this process: the one that started it does."""
     _process.said = True

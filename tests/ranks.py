@@ -93,6 +93,7 @@ def start(module: str, words: Sequence[Sequence[object]]) -> list[subprocess.Pop
         port = free.getsockname()[1]
     size = str(len(words))
     shared = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "TORCHELASTIC_RUN_ID": "test"}
+    shared |= {"TORCH_CPP_LOG_LEVEL": "FATAL"}  # as the command line sets it, before `tests.ranks` imports torch
     shared |= {"WORLD_SIZE": size, "LOCAL_WORLD_SIZE": size, "OMP_NUM_THREADS": "1"}
     return [
         subprocess.Popen(

@@ -14,6 +14,8 @@ def main() -> None:
     import gc
     import os
 
+    if "TORCHELASTIC_RUN_ID" in os.environ:  # C++ reports of ranks that are gone; torch reads it when it is imported
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
     if "LAPGS_RANK_REPORTS" in os.environ:
         from lapgs_plugin.interrupt import be_silent
 

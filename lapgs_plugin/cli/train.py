@@ -7,6 +7,7 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -175,7 +176,9 @@ def train(
         context.obj.train(request)
         return
     request = replace(request, ranks=joined(), shard=start.shard)
-    with prepare(request, partial(say, stderr=True)) as run:
+    if request.ranks.size > 1:  # signals end imports at once: rank 0 could not say why another rank failed
+        import_module("lapgs_plugin.training.trainer")
+    with request.ranks.explained(), prepare(request, partial(say, stderr=True)) as run:
         path, extended = run.archive.path(RUN_CONFIG), None
         if leads:
             extended = _write_options(path, run, context)
@@ -240,7 +243,7 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: Til
     if tiling.tiles is None and not continues:
         return False
     shape = None if tiling.tiles is None else tiling.shape
-    if train_tiles(request, shape, started, tell, only_base=tiling.only_base):
+    if train_tiles(request, shape, started, tell, queue=say if tiling.only_base else None):
         _save_preview(out, scene)
         _say_what_is_next(out)
     return True

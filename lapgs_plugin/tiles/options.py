@@ -42,8 +42,8 @@ class TileOptions:
 
     only_base: bool = option(
         False,
-        "End after the coarser levels of --tiles and print the command of each tile, for a queue or other machines; "
-        "--resume trains those that are missing and merges all.",
+        "End after the coarser levels of --tiles and print the command of each tile on a line, on stdout, for "
+        "a queue or other machines; --resume trains those that are missing and merges all.",
         panel=PANEL,
     )
 

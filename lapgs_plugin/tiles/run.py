@@ -74,7 +74,7 @@ class Tile:
 
 
 def train_tiles(
-    request: TrainRequest, shape: tuple[int, int] | None, train: Train, say: Say, only_base: bool = False
+    request: TrainRequest, shape: tuple[int, int] | None, train: Train, say: Say, queue: Say | None = None
 ) -> bool:
     """Train a run in tiles, or continue it: what is finished already is left as it is. Return whether it is complete.
 
@@ -83,7 +83,7 @@ def train_tiles(
         shape: rows and columns; None chooses them, or takes those of the run that is continued.
         train: trains the base and each tile.
         say: shows a line to the user.
-        only_base: end before the tiles, after their commands were shown.
+        queue: takes the command of each tile, which is not trained here then; None trains and merges them.
 
     Raises:
         UserInputError: no tile is seen by enough views.
@@ -107,9 +107,9 @@ def train_tiles(
         train(run, SHARED)
     del run  # and its photos
     tiles = [Tile(out, scene, place) for place in grid]
-    for tile in tiles if only_base else ():
-        say(tile.command)
-    if only_base:
+    if queue is not None:
+        for tile in tiles:
+            queue(tile.command)
         return False
     unseen = {tile.place for tile in tiles if not train_tile(tile, tile.folder, request.control, train, say)}
     if len(unseen) == len(tiles):

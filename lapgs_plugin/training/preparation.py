@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from statistics import fmean
@@ -36,7 +36,7 @@ from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
 from lapgs_plugin.training.planning import make_plan, require_pruning
 from lapgs_plugin.training.prepared_run import PreparedRun
 from lapgs_plugin.training.ranks.archive import open_for
-from lapgs_plugin.training.ranks.equality import require_same
+from lapgs_plugin.training.ranks.equality import require_same, source_checksum
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
@@ -118,7 +118,7 @@ def prepare(request: TrainRequest, say: Say = logger.info) -> AbstractContextMan
     photos, settings, ranks = request.photos, request.settings, request.ranks
     _require_one_process(ranks, settings)
     say = say if ranks.leads else _silent
-    require_same(ranks, {"lapgs_plugin": __version__, "PyTorch": torch.__version__})
+    _require_same_command(request)
     depth = resolve_depth(Path(request.scene), settings.depth)
     normals = resolve_normals(Path(request.scene), settings.normals)
     if normals != NONE and depth == NONE:
@@ -376,6 +376,22 @@ def _require_one_process(ranks: Ranks, settings: TrainSettings) -> None:
     """Refuse ranks with --stop auto: views that are given back would belong to other ranks than before."""
     if settings.stops_early and ranks.size > 1:
         raise UserInputError(f"{ranks.together} with --stop auto: ends runs of one process alone; leave one out")
+
+
+def _require_same_command(request: TrainRequest) -> None:
+    """Refuse ranks of other versions or options than rank 0; see `_require_same_run` for what follows from them."""
+    if request.ranks.size == 1:
+        return
+    options = {
+        **asdict(request.photos),
+        **asdict(request.control),
+        "out": str(request.out),
+        "resume": request.resume,
+        "overwrite": request.overwrite,
+        "shard": request.shard,
+    }
+    versions = {"version": __version__, "checksum of its files": source_checksum()}
+    require_same(request.ranks, {"lapgs_plugin": versions, "PyTorch": torch.__version__, "options": options})
 
 
 def _require_same_run(ranks: Ranks, scene: Scene, settings: TrainSettings) -> None:

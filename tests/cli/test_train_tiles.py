@@ -34,15 +34,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Lapgs:
-    """Return a function that runs a command in this process, and returns its messages; it fails if `fails`."""
+    """Return a function that runs a command in this process; it fails if `fails`.
+
+    It returns messages, of --only-base what a queue reads.
+    """
 
     def call(*words: object, fails: bool = False) -> str:
         monkeypatch.setattr(sys, "argv", ["lapgs", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
             app.run()
-        messages = capsys.readouterr().err
-        assert ended.value.code == (2 if fails else 0), messages
-        return messages
+        printed = capsys.readouterr()
+        assert ended.value.code == (2 if fails else 0), printed.err
+        return printed.out if "--only-base" in words else printed.err
 
     return call
 
@@ -51,8 +54,8 @@ def fields_of(run: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted(run.glob(f"**/{PLY}"))]
 
 
-def tile_commands(messages: str) -> list[list[str]]:
-    return [shlex.split(line)[1:] for line in messages.splitlines() if line.startswith("lapgs train ")]
+def tile_commands(printed: str) -> list[list[str]]:
+    return [shlex.split(line)[1:] for line in printed.splitlines()]
 
 
 def test_tiles_end_as_one_run(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:

@@ -23,8 +23,8 @@ from lapgs_plugin.runs.layout import CACHE, CHECKPOINT, HISTORY
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.preparation import TrainRequest, prepare
-from lapgs_plugin.training.ranks.equality import digest
-from lapgs_plugin.training.ranks.group import ALONE
+from lapgs_plugin.training.ranks.equality import digest, require_same, source_checksum
+from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.ranks.shards import epoch_order, tree_sum
 from lapgs_plugin.training.ranks.steps import SharedSteps
 from lapgs_plugin.training.settings import Densification, TrainSettings
@@ -142,6 +142,70 @@ def test_ranks_of_different_runs_are_refused_by_rank_0_alone(
     assert not (folder / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "facts"),
+    [
+        (["missing"], "rank 1 of 2: missing: no such scene folder"),
+        (["SCENE", "--background", "white"], "rank 1 has other options than rank 0 (background: white and black)"),
+    ],
+)
+def test_why_one_rank_cannot_go_on_is_said_by_rank_0_alone(
+    words: list[str], facts: str, scene: Path, tmp_path: Path
+) -> None:
+    own = [str(scene) if word == "SCENE" else word for word in words]
+    out = ["-o", tmp_path / "run", *OPTIONS]
+    started = ranks.start("lapgs_plugin", [["train", scene, *out], ["train", *own, *out]])
+    first, second = (process.communicate(timeout=TIMEOUT)[0] for process in started)
+    assert [process.returncode for process in started] == [2, 2]
+    (line,) = errors(first)
+    assert facts in line
+    assert errors(second) == []
+    assert not (tmp_path / "run").exists()
+
+
+class TwoThatSay(Ranks):
+    """Two ranks that have what they are given."""
+
+    size = 2
+
+    def __init__(self, theirs: dict[str, Any]) -> None:
+        self.theirs = theirs
+
+    def gathered(self, value: Any) -> list[Any]:
+        return [value, self.theirs]
+
+
+@pytest.mark.parametrize(
+    ("theirs", "facts"),
+    [
+        ({"settings": {"seed": 0, "rates": {"sh": 0.1}, "of": [1]}}, r"other settings than rank 0 \(sh: 0.1 and 0.2\)"),
+        ({"settings": {"seed": 0, "rates": None, "of": [1]}}, r"\(rates: None and {'sh': 0.2}\)"),
+        ({"settings": {"seed": 0, "rates": {"sh": 0.2}, "of": [2]}}, r"\(of: 2 and 1\)"),
+        ({"settings": {"seed": 0, "rates": {"sh": 0.2}, "of": None}}, r"\(of: None and \[1\]\)"),
+        ({"settings": {"seed": 0, "rates": {"sh": 0.2}, "of": [1], "new": 3}}, r"\(new: 3 and None\)"),
+    ],
+)
+def test_the_value_that_differs_is_named(theirs: dict[str, Any], facts: str) -> None:
+    ours = {"settings": {"seed": 0, "rates": {"sh": 0.2}, "of": [1]}}
+    require_same(TwoThatSay(ours), ours)
+    with pytest.raises(UserInputError, match=facts):
+        require_same(TwoThatSay(theirs), ours)
+
+
+def test_a_checksum_tells_versions_apart(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    file = tmp_path / "inner" / "a.py"
+    checksums = set()
+    for text in ("", "1", "2"):
+        file.write_text(text)
+        checksums |= {source_checksum(tmp_path)}
+    file.rename(tmp_path / "b.py")
+    checksums |= {source_checksum(tmp_path)}
+    assert len(checksums) == 4
+    (tmp_path / "b.pyc").write_text("compiled")
+    assert source_checksum(tmp_path) in checksums
+
+
 def stopped_on_two(scene: Path, out: Path) -> None:
     """Start a run on two ranks, and stop it by SIGTERM; checks its line."""
     on_two = command("train", scene, "-o", out, *OPTIONS, "--processes", 2)
@@ -187,6 +251,47 @@ def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
     assert "--resume" in line
 
     on_one = command(*words)
+    output, _ = on_one.communicate(timeout=TIMEOUT)
+    assert on_one.returncode == 0, output
+    assert plys(RunArchive.open(out)) == whole
+
+
+def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene", [f"{number:02d}.png" for number in range(16)])
+    damaged = sorted(scene.rglob("*.png"))[1]  # of rank 1
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+            *("-m", "lapgs_plugin", *map(str, words)),
+        ],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=TIMEOUT,
+    )
+    assert ended.returncode == 1
+    (line,) = (line for line in ended.stdout.splitlines() if line.startswith("lapgs:"))
+    assert damaged.name in line
+    assert "damaged or cut short" in line
+
+
+@pytest.mark.slow
+def test_ranks_whose_command_is_killed_leave_a_checkpoint_and_end(
+    scene: Path, whole: list[bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    on_two = command("train", scene, "-o", out, *OPTIONS, "--processes", 2)
+    wait_for(lambda: on_two.poll() is not None or (out / HISTORY).exists(), TIMEOUT)
+    on_two.kill()
+    began = time.monotonic()
+    on_two.communicate(timeout=TIMEOUT)  # to the end of the ranks, which have its output
+    assert time.monotonic() - began < 30.0
+    assert (out / CHECKPOINT).exists()
+    on_one = command("train", scene, "-o", out, *OPTIONS, "--resume")
     output, _ = on_one.communicate(timeout=TIMEOUT)
     assert on_one.returncode == 0, output
     assert plys(RunArchive.open(out)) == whole

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import torch
 
+import lapgs_plugin
 from lapgs_plugin.errors import LapgsError, UserInputError
 from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.ranks.group import Ranks
@@ -38,12 +41,24 @@ def require_same(ranks: Ranks, values: Mapping[str, Any]) -> None:
 
 def _difference(theirs: Any, ours: Any) -> str:
     """Return the first entry in which two values differ, or the values."""
-    if isinstance(ours, Mapping):
+    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
         name = next(name for name in {**ours, **theirs} if theirs.get(name) != ours.get(name))
-        return f"{name}: {theirs.get(name)} and {ours.get(name)}"
-    if isinstance(ours, list) and len(ours) == len(theirs):
-        return next(f"{one} and {other}" for one, other in zip(theirs, ours, strict=True) if one != other)
-    return f"{len(theirs)} and {len(ours)}" if isinstance(ours, list) else f"{theirs} and {ours}"
+        one, other = theirs.get(name), ours.get(name)
+        inner = _difference(one, other)
+        return inner if isinstance(one, Mapping) and isinstance(other, Mapping) else f"{name}: {inner}"
+    if isinstance(ours, list) and isinstance(theirs, list):
+        if len(ours) == len(theirs):
+            return next(f"{one} and {other}" for one, other in zip(theirs, ours, strict=True) if one != other)
+        return f"{len(theirs)} and {len(ours)}"
+    return f"{theirs} and {ours}"
+
+
+def source_checksum(root: Path = Path(lapgs_plugin.__file__).parent) -> str:
+    """Return a checksum of a package's source files, this one's by default: two checkouts often have one version."""
+    checksum = 0
+    for file in sorted(root.rglob("*.py")):
+        checksum = crc32(file.read_bytes(), crc32(file.relative_to(root).as_posix().encode(), checksum))
+    return f"{checksum:08x}"
 
 
 def digest(models: Sequence[TrainableField]) -> tuple[int, ...]:

@@ -7,25 +7,33 @@ the device for sums of tensors, NCCL on GPUs. Every rank calls the same methods 
 from __future__ import annotations
 
 import os
+import re
 import sys
+import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from lapgs_plugin import interrupt
 from lapgs_plugin.errors import LapgsError, MissingExtraError, UserInputError, first_line
 from lapgs_plugin.stages.view_transforms import Processes
 from lapgs_plugin.training.ranks.shards import tree_sum
 
 PATIENCE = timedelta(days=1)
 """How long a rank waits for the others: a viewer may hold training. Ranks that die are noticed at once."""
+JOINING = timedelta(minutes=5)
+"""How long a rank waits for the port of the group to answer."""
 STEPS_A_DECISION = 8
 """Steps from one decision in common to the next on GPUs: each costs about 0.1 ms, and a step a few."""
 ROWS_OF_A_MESSAGE = 1 << 20
 """Rows of a tensor that are sent to rank 0 at once: gloo's messages have a limit."""
+
+_FAILURE = "lapgs/failure"
+"""Key of the group's store under which the first rank that fails by itself says why."""
 
 _Value = TypeVar("_Value")
 
@@ -107,6 +115,17 @@ class Ranks(Processes):
         """Return the rows of all ranks' tensors, one after the other, on rank 0's processor; others keep theirs."""
         return tensor
 
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Let rank 0, inside the block, raise the error of the rank that failed instead of that rank's loss.
+
+        Ranks but 0 print nothing, and the ranks of several machines have no folder in common before a run has one.
+
+        Raises:
+            RankLostError: on rank 0, with the message of the rank that failed first.
+        """
+        yield
+
     def close(self) -> None:
         """Leave the group."""
 
@@ -124,6 +143,7 @@ class JoinedRanks(Ranks):
 
     def __init__(self, rank: int, size: int, local_rank: int) -> None:
         import torch.distributed as dist
+        from torch.distributed.rendezvous import rendezvous
 
         self.rank, self.size, self._local_rank = rank, size, local_rank
         self._dist: Any = dist
@@ -132,10 +152,11 @@ class JoinedRanks(Ranks):
         if local_rank < torch.cuda.device_count():
             torch.cuda.set_device(local_rank)  # before anything is put on a GPU
         try:
-            dist.init_process_group("gloo", timeout=PATIENCE)
+            self._store: Any = next(rendezvous("env://", rank, size, timeout=JOINING))[0]
+            dist.init_process_group("gloo", store=self._store, rank=rank, world_size=size, timeout=PATIENCE)
         except (RuntimeError, ValueError) as error:
             raise UserInputError(
-                f"rank {rank} of {size} cannot reach the others ({first_line(error)}); is the port of MASTER_PORT, "
+                f"rank {rank} of {size} cannot reach the others ({_reason(error)}); is the port of MASTER_PORT, "
                 f"{os.environ.get('MASTER_PORT', '')}, taken? torchrun --standalone or --gpus take a free one"
             ) from error
 
@@ -243,10 +264,35 @@ class JoinedRanks(Ranks):
                 start += count
         return whole
 
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        try:
+            yield
+        except (RankLostError, interrupt.Interrupted):  # the agent ends the other ranks of one that failed
+            interrupt.ignore()
+            if self.leads and (failure := self._failure()) is not None:
+                interrupt.withdraw()
+                raise RankLostError(*failure.splitlines()) from None
+            raise
+        except Exception as error:
+            text = str(error) if isinstance(error, LapgsError) else traceback.format_exc()
+            with suppress(RuntimeError):  # nobody is left
+                if self._failure() is None:
+                    self._store.set(_FAILURE, f"rank {self.rank} of {self.size}: {text}")
+            raise
+
+    def _failure(self) -> str | None:
+        """Return why a rank failed, if one did by itself and could say so."""
+        with suppress(RuntimeError):  # its store may be gone with it
+            if self._store.check([_FAILURE]):
+                return str(self._store.get(_FAILURE).decode())
+        return None
+
     def close(self) -> None:
         if self._sums is not None:
             torch.cuda.synchronize()
         self._dist.destroy_process_group()
+        self._store = None  # rank 0's holds the port of the next group
 
     @contextmanager
     def _others(self) -> Iterator[None]:
@@ -257,9 +303,18 @@ class JoinedRanks(Ranks):
             raise
         except (RuntimeError, ValueError) as error:
             raise RankLostError(
-                f"rank {self.rank} of {self.size} lost another rank ({first_line(error)}); the last checkpoint "
+                f"rank {self.rank} of {self.size} lost another rank ({_reason(error)}); the last checkpoint "
                 "continues with --resume, also on fewer ranks"
             ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """Return the first sentence of an error of a communication library, without the source file that begins it.
+
+    >>> _reason(RuntimeError("[/builds/gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:1680. See the logs."))
+    'Connection closed by peer [127.0.0.1]:1680'
+    """
+    return re.sub(r"^\[\S*\] ", "", first_line(error)).split(". ")[0]
 
 
 def joined() -> Ranks:

@@ -28,7 +28,7 @@ REPORTS = "LAPGS_RANK_REPORTS"
 GRACE = 20.0
 """Seconds that a rank has to end after a signal: it may wait in a GPU's queue for a rank that is gone."""
 POLL = 0.2
-"""Seconds between two looks of the agent at its ranks."""
+"""Seconds between two looks of the agent at its ranks, and of a rank at its agent."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ def join_started(option: str, asked: int | None) -> None:
             f"{option} {asked}: torchrun started {started} ranks; leave the option out, or give {started}"
         )
     _end_when_stuck()
+    threading.Thread(target=_stop_without_agent, name="agent", daemon=True).start()
 
 
 def leads() -> bool:
@@ -109,6 +110,14 @@ def _end_when_stuck() -> None:
     threading.Thread(target=watch, name="signals", daemon=True).start()
 
 
+def _stop_without_agent() -> None:
+    """Stop this process as by SIGTERM once the agent that started it is gone: nobody else would end the ranks."""
+    agent = os.getppid()
+    while os.getppid() == agent:
+        time.sleep(POLL)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def require_gpus(count: int, rasterizer: str) -> None:
     """Check that --gpus can be had.
 
@@ -141,7 +150,6 @@ def launch(count: int, on_gpus: bool, words: Iterable[str]) -> None:
     with tempfile.TemporaryDirectory(prefix="lapgs-ranks-") as folder:
         os.environ[REPORTS] = folder
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_processors() // count)))
-        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")  # C++ reports of ranks that are gone
         if not on_gpus:
             os.environ["CUDA_VISIBLE_DEVICES"] = ""
         failures = _run_agent(count, [sys.executable, "-m", "lapgs_plugin", *words], folder)
