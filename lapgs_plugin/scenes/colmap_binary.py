@@ -9,14 +9,14 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pycolmap
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.files import refuse_lfs_pointer
-from lapgs_plugin.scenes.colmap_records import LARGEST_ID, NO_FEATURES, Points, PosedImage, file_name
+from lapgs_plugin.scenes.colmap_records import LARGEST_ID, NO_FEATURES, OTHER_LENS, Points, PosedImage, file_name
 from lapgs_plugin.untrusted import require_regular
 
 _COUNT = struct.Struct("<Q")
@@ -25,6 +25,10 @@ _IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 8 + 3 * 8 + 3 + 8  # id, position, colour, error
 _OBSERVATION_BYTES = 2 * 8 + 8
 _TRACK_BYTES = 4 + 4
+
+
+KINDS = frozenset(int(kind) for name, kind in pycolmap.CameraModelId.__members__.items() if name != "INVALID")
+"""Numbers of COLMAP's camera models."""
 
 
 class BinaryRecords:
@@ -59,12 +63,14 @@ def read_cameras(file: Path) -> dict[int, pycolmap.Camera]:
     """Return the cameras of cameras.bin by id.
 
     Raises:
-        SceneError: the file is damaged, or holds an id twice.
+        SceneError: the file is damaged, holds an id twice or a camera model that is none of COLMAP's.
     """
     cameras: dict[int, pycolmap.Camera] = {}
     with _whole(file) as records:
         for _ in range(records.take_count()):
             key, kind, width, height = records.take(_CAMERA)
+            if kind not in KINDS:
+                _refuse_kind(file, key, kind)
             camera = pycolmap.Camera.create_from_model_id(key, pycolmap.CameraModelId(kind), 1.0, 1, 1)
             camera.width, camera.height = width, height
             camera.params = list(records.take(struct.Struct(f"<{len(camera.params)}d")))
@@ -129,12 +135,20 @@ def _whole(file: Path) -> Iterator[BinaryRecords]:
         yield records
     except SceneError:
         raise
-    except (struct.error, ValueError) as error:  # the data ends inside a record or a name, or there is no such model
+    except (struct.error, ValueError) as error:  # the data ends inside a record or a name
         refuse_lfs_pointer(file, SceneError)
         raise SceneError(
             f"{file}: the file is damaged or cut short at {len(records.data)} bytes, expected all records that its "
             "header counts; copy it again"
         ) from error
+
+
+def _refuse_kind(file: Path, key: int, kind: int) -> NoReturn:
+    refuse_lfs_pointer(file, SceneError)
+    raise SceneError(
+        f"{file}: camera {key} has the camera model of number {kind}, expected one of COLMAP's from {min(KINDS)} to "
+        f"{max(KINDS)}; copy the file again if it is damaged, else {OTHER_LENS}"
+    )
 
 
 def _check_id(file: Path, key: int, known: dict[int, Any]) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+OTHER_LENS = "calibrate with OPENCV, with OPENCV_FISHEYE a fisheye, or export undistorted photos with pinhole cameras"
+"""Advice where the camera model is none of COLMAP's."""
 LARGEST_ID = 2**32 - 2
 """Largest id of a camera or an image; the next number means none."""
 UNIT_TOLERANCE = 1e-2

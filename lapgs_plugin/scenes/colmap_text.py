@@ -23,6 +23,7 @@ from lapgs_plugin.scenes.colmap_records import (
     LARGEST_ID,
     NO_FEATURES,
     NO_TRACK,
+    OTHER_LENS,
     UNIT_TOLERANCE,
     Points,
     PosedImage,
@@ -48,11 +49,9 @@ class _Line:
         self.file, self.number, self.text = file, number, text
         self.words = text.split(maxsplit=first_words)
 
-    def refuse(self, expected: str) -> NoReturn:
+    def refuse(self, expected: str, advice: str = "copy or export the model again") -> NoReturn:
         quoted = self.text if len(self.text) <= SHOWN else f"{self.text[:SHOWN]}..."
-        raise SceneError(
-            f"{self.file}: line {self.number} is {quoted!r}, expected {expected}; copy or export the model again"
-        )
+        raise SceneError(f"{self.file}: line {self.number} is {quoted!r}, expected {expected}; {advice}")
 
     def whole(self, words: Sequence[str], expected: str) -> list[int]:
         """Return words as whole numbers, such as 7 or numpy's 7.0, or refuse the line."""
@@ -104,7 +103,7 @@ def read_cameras(file: Path) -> dict[int, pycolmap.Camera]:
             line.refuse(f"{CAMERA} with positive numbers")
         model = line.words[1].upper()
         if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-            line.refuse(f"a camera model of COLMAP, such as PINHOLE, in place of {model[:SHOWN]}")
+            line.refuse(f"a camera model of COLMAP in place of {model[:SHOWN]}", OTHER_LENS)
         camera = pycolmap.Camera.create_from_model_name(key, model, 1.0, 1, 1)
         count = len(camera.params)
         if len(values := line.finite(line.words[4:], f"{count} finite parameters of {model}")) != count:

@@ -1,7 +1,8 @@
-"""Open exports with other people's readers: splat-transform and the engine of PlayCanvas, and Adobe's build of spz.
+"""Open exports with other people's readers: splat-transform, the engine of PlayCanvas, Babylon, and Adobe's spz.
 
-They come from npm: make a folder, run `npm install @playcanvas/splat-transform @adobe/spz node@22` there, and set
-LAPGS_NPM to it. splat-transform brings the engine.
+They come from npm: make a folder, run `npm install @playcanvas/splat-transform @adobe/spz @babylonjs/core
+@babylonjs/loaders node@22` there, and set LAPGS_NPM to it. splat-transform brings the engine; its versions for older
+nodes cannot read levels of detail.
 """
 
 from __future__ import annotations
@@ -63,6 +64,22 @@ asset.ready(() => {
 });
 app.assets.add(asset);
 app.assets.load(asset);
+"""
+
+READ_GLB_BY_BABYLON = """
+import fs from 'node:fs';
+import { LoadAssetContainerAsync, NullEngine, Scene, SceneLoader } from '@babylonjs/core/index.js';
+import '@babylonjs/loaders/glTF/index.js';
+globalThis.Worker = class { postMessage() {} terminate() {} };  // sorts for a camera, which node has no use for
+SceneLoader.OnPluginActivatedObservable.add((plugin) => {
+    plugin.onMeshLoadedObservable.add((mesh) => { mesh._keepInRam = true; });
+});
+const bytes = new Uint8Array(fs.readFileSync(process.argv[1]));
+const { meshes } = await LoadAssetContainerAsync(bytes, new Scene(new NullEngine()), { pluginExtension: '.glb' });
+const [splats] = meshes.filter((mesh) => mesh.getClassName() === 'GaussianSplattingMesh');
+const rows = { bytes: Array.from(new Uint8Array(splats.splatsData)), degree: splats.shDegree };
+fs.writeSync(1, JSON.stringify(rows) + '\\n');
+process.exit(0);
 """
 
 
@@ -130,3 +147,20 @@ def test_the_engine_of_playcanvas_reads_gltf(exported: Path) -> None:
     np.testing.assert_allclose(engine.numpy()[nearest], field.means.numpy(), atol=1e-6)
     np.testing.assert_allclose(read["f_dc_1"][nearest], field.sh[:, 0, 1].numpy(), atol=1e-6)
     assert np.isfinite(read["opacity"]).all()
+
+
+def test_babylon_reads_gltf(exported: Path) -> None:
+    if not (MODULES / "@babylonjs" / "loaders").is_dir():
+        pytest.skip("needs @babylonjs/core and @babylonjs/loaders in the folder LAPGS_NPM")
+    field = y_up(RunArchive.open(exported).field(0))
+    read = columns(READ_GLB_BY_BABYLON, exported / "export" / "lod" / "level_0.glb")
+    # A row is that of a .splat file: means and scales as float32, colours and opacity, quaternion w, x, y, z as bytes.
+    rows = read["bytes"].astype(np.uint8).reshape(len(field), 32)
+    geometry = rows[:, :24].copy().view(np.float32)
+    np.testing.assert_array_equal(geometry[:, :3], field.means.numpy())
+    np.testing.assert_allclose(geometry[:, 3:], field.log_scales.exp().numpy(), rtol=1e-6)
+    assert int(read["degree"]) == field.sh_degree
+    shown = (field.sh[:, 0] * 0.28209479177387814 + 0.5).clamp(0, 1).numpy() * 255
+    np.testing.assert_allclose(rows[:, 24:27], shown, atol=0.51)
+    quaternions = torch.nn.functional.normalize(field.quaternions, dim=1).numpy()
+    np.testing.assert_allclose(rows[:, 28:], quaternions * 127.5 + 127.5, atol=0.51)
