@@ -146,17 +146,23 @@ def _is_value(expression: ast.expr) -> bool:
 
 
 class VisibleIndices(Change):
-    """Replace `(radii > 0).nonzero()`."""
+    """Replace `(radii > 0).nonzero()` in the results of a renderer, which does not use them itself."""
 
-    def visit_Call(self, node: ast.Call) -> ast.AST:
-        """Return the node or its replacement."""
+    def visit_Dict(self, node: ast.Dict) -> ast.AST:
+        """Return the node with another value of `KEY`."""
         self.generic_visit(node)
-        match node:
-            case ast.Call(
-                ast.Attribute(ast.Compare(ast.Name() as radii, [ast.Gt()], [ast.Constant(0)]), "nonzero"), [], []
-            ):
-                self.changes += 1
-                return ast.copy_location(call(VISIBLE, radii), node)
+        for position, item in enumerate(zip(node.keys, node.values, strict=True)):
+            match item:
+                case (
+                    ast.Constant(str(key)),
+                    ast.Call(
+                        ast.Attribute(ast.Compare(ast.Name() as radii, [ast.Gt()], [ast.Constant(0)]), "nonzero"),
+                        [],
+                        [],
+                    ) as indices,
+                ) if key == KEY:
+                    self.changes += 1
+                    node.values[position] = ast.copy_location(call(VISIBLE, radii), indices)
         return node
 
 
@@ -246,15 +252,15 @@ def _is_only_updated_by(node: ast.Call, argument: ast.expr, methods: Mapping[str
     return only_updates_by(method, method.args.args[position].arg)
 
 
-def keeps_masks(training: ast.FunctionDef, renderers: Collection[str], methods: Mapping[str, ast.FunctionDef]) -> bool:
-    """Return whether a training function uses the indices of its renders for nothing but updates of their rows.
+def keeps_masks(function: ast.FunctionDef, renderers: Collection[str], methods: Mapping[str, ast.FunctionDef]) -> bool:
+    """Return whether a function uses the indices of its renders for nothing but updates of their rows, or not at all.
 
     Args:
-        training: its tree, not changed yet.
+        function: its tree, not changed yet.
         renderers: names of the functions that return the indices, as `KEY` of their results.
         methods: of the model, by name.
     """
-    nodes = list(ast.walk(training))
+    nodes = list(ast.walk(function))
     parents = {child: node for node in nodes for child in ast.iter_child_nodes(node)}
     results = set()
     for node in nodes:
@@ -275,7 +281,7 @@ def keeps_masks(training: ast.FunctionDef, renderers: Collection[str], methods: 
                         masks.add(_variable(item, parents))
                 case _:
                     return False
-    return bool(masks) and all(mask is not None and only_updates_by(training, mask, methods) for mask in masks)
+    return all(mask is not None and only_updates_by(function, mask, methods) for mask in masks)
 
 
 def _variable(value: ast.expr, parents: Mapping[ast.AST, ast.AST]) -> str | None:

@@ -99,7 +99,7 @@ class RasterizerWrapper:
         @wraps(original)
         def render(*args: Any, **kwargs: Any) -> Any:
             outer, (key, values, evaluates_sh) = self.running, _told_by((*args, *kwargs.values()))
-            location, by_mask = outer.location, outer.by_mask and self._takes_image_alone
+            location, by_mask = outer.location, self._takes_image_alone
             if outer.way is None:
                 caller = sys._getframe(1)
                 location = f"{_file_name(caller.f_code.co_filename)}:{caller.f_lineno}"

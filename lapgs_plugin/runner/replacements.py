@@ -7,11 +7,12 @@ import inspect
 import logging
 from collections.abc import Callable
 from functools import wraps
+from types import FunctionType
 from typing import Any, TypeGuard
 
 from lapgs_plugin.checkouts.attachment import Replacement, of_class
 from lapgs_plugin.checkouts.concurrent_runs import beside_other_runs
-from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile
+from lapgs_plugin.checkouts.profile import OPACITY_RESET, Profile, held_by
 from lapgs_plugin.checkouts.rewriting import tree_of
 from lapgs_plugin.checkouts.syntax import called_methods, called_name, called_names
 from lapgs_plugin.checkouts.training_call import TrainingCall
@@ -110,7 +111,7 @@ class StageReplacements:
             control[OPACITY_RESET] = self._make_opacity_reset
         replaced: dict[str, Callable[..., Any]] = {"training_setup": self._make_training_setup, **control}
         if (rows := self._context.wrapper.rows) is not None:
-            self._note_loop(rows, profile)
+            self._note_callers(rows, profile)
             replaced[STATISTICS] = rows.updating
         return [
             replacement
@@ -119,11 +120,14 @@ class StageReplacements:
         ]
 
     @staticmethod
-    def _note_loop(rows: VisibleRows, profile: Profile) -> None:
-        names = {
-            name for renderer in profile.renderers for name in (*profile.script_names(renderer), renderer.__name__)
-        }
-        rows.note_loop(profile.training, names, _statistics(profile))
+    def _note_callers(rows: VisibleRows, profile: Profile) -> None:
+        """Note which functions of the script, and of modules that import a renderer, need no indices of Gaussians."""
+        holders = [holder for renderer in profile.renderers for holder in profile.holders(renderer)]
+        names = {name for _, name in holders} | {renderer.__name__ for renderer in profile.renderers}
+        functions = [value for module, _ in holders for _, value in held_by(module) if isinstance(value, FunctionType)]
+        callers: list[Callable[..., Any]] = [f for f in functions if names & set(f.__code__.co_names)]
+        for function in dict.fromkeys([profile.training, *callers]):
+            rows.note_caller(function, names, _statistics(profile))
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""

@@ -83,6 +83,7 @@ class StageRendering:
         on_call: called when gradients are recorded with key, composed image, rasterizer, its inputs and its settings;
             returns the image to use instead.
         capture: keep the last call in `captured`, its image without the appearance of a photo.
+        for_image: whether nothing but the image is read of calls that are captured.
         kept: zeros of the last render, by what they are for.
     """
 
@@ -97,6 +98,7 @@ class StageRendering:
     as_photographed: Callable[[str, Tensor], Tensor] | None = None
     on_call: OnCall | None = None
     capture: bool = False
+    for_image: bool = False
     captured: Captured | None = field(default=None, repr=False)
     kept: dict[str, KeptZeros] = field(default_factory=dict, repr=False)
     _told: bool = field(default=False, repr=False)
@@ -144,7 +146,7 @@ class StageRendering:
     def takes_parts(self) -> bool:
         """Whether a rasterizer may get SH in parts: nothing else reads its inputs, and gradients are recorded."""
         precomputed = self.signed and self.path is ColorPath.PRECOMPUTED
-        return torch.is_grad_enabled() and not self.capture and not precomputed
+        return torch.is_grad_enabled() and (self.for_image or not self.capture) and not precomputed
 
     def prefetch(self, key: str) -> None:
         """Copy a view's images to the device while it is being rendered."""

@@ -33,7 +33,7 @@ class VisibleRows:
     """Change the functions of a checkout that return or use the visible Gaussians of a render."""
 
     def __init__(self) -> None:
-        self._loop: Place | None = None  # the training function, if it needs no indices
+        self._for_masks: set[Place] = set()  # functions that need no indices
         self._changed: dict[Callable[..., Any], Callable[..., Any]] = {}
 
     def updating(self, function: Callable[..., Any], methods: Methods | None = None) -> Callable[..., Any]:
@@ -55,21 +55,21 @@ class VisibleRows:
 
         return rewritten(function, lambda _: MaskedUpdates(trees), {UPDATE: _update, KNOWN: is_known})
 
-    def note_loop(self, training: Callable[..., Any], renderers: Collection[str], methods: Methods) -> None:
-        """Note whether the loop needs indices, or masks do.
+    def note_caller(self, function: Callable[..., Any], renderers: Collection[str], methods: Methods) -> None:
+        """Note whether a function that calls renderers needs indices, or masks do.
 
         Args:
-            training: the script's training function.
+            function: the script's training function, or a score function.
             renderers: names by which it may call renderers.
-            methods: of its model, by name, that get a render's indices.
+            methods: of the model, by name, that get a render's indices.
         """
-        tree = tree_of(training)
+        tree = tree_of(function)
         if tree is not None and keeps_masks(tree, renderers, _trees(methods)):
-            self._loop = _place(training.__code__)
+            self._for_masks.add(_place(function.__code__))
 
     def is_for_masks(self, caller: CodeType) -> bool:
         """Return whether a function that calls a renderer needs no indices."""
-        return self._loop == _place(caller)
+        return _place(caller) in self._for_masks
 
     def in_renderer(self, renderer: Callable[..., Any], by_mask: Callable[[], bool]) -> Callable[..., Any]:
         """Return a renderer that returns `radii > 0` in the place of its indices.

@@ -26,6 +26,7 @@ from lapgs_plugin.runner.joint import JointModels
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs
 from lapgs_plugin.scenes import load_scene
+from lapgs_plugin.stages.joint import RenderedPredictions
 from tests.contract.stub_runs import (
     HALF,
     NAMES,
@@ -186,6 +187,53 @@ def test_predictions_are_up_of_the_archived_levels(big: Path, tmp_path: Path, mo
     run_residuals(STUBS["graphdeco"], big, tmp_path / "run", "--iterations", 12, levels=3, joint=0.5)
     assert [len(quantiles) for quantiles in inspected.results] == [3, 3], "two residual stages"
     assert max(max(quantiles) for quantiles in inspected.results) < 5e-6  # 1.8e-7 seen
+
+
+def test_scores_render_the_finished_field_of_a_view_once(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until it steps: a score function renders each view twice, and both images are those of the present field."""
+    predict, render = RenderedPredictions.get, CheckoutContext.render
+    renders: list[Any] = []
+    scored: list[int] = []  # renders of finished fields for each image of a score
+    differences: list[float] = []
+
+    def counted(*args: Any, **options: Any) -> Any:
+        renders.append(args)
+        return render(*args, **options)
+
+    def compared(predictions: RenderedPredictions, *names: str) -> Tensor:
+        before = len(renders)
+        image = predict(predictions, *names)
+        if not torch.is_grad_enabled():
+            scored.append(len(renders) - before)
+            with torch.enable_grad():
+                differences.append(float((predict(predictions, *names) - image).detach().abs().max()))
+        return image
+
+    monkeypatch.setattr(CheckoutContext, "render", counted)
+    monkeypatch.setattr(RenderedPredictions, "get", compared)
+    run_residuals(STUBS["fastgs"], scene, tmp_path / "run", joint=1.0)
+    assert scored[:20] == [1, 0] * 10, "ten views of the first score"
+    assert max(differences) < 1e-6  # 1.8e-7 seen: Up has other kernels with gradients
+
+
+def test_scores_list_no_visible_gaussians(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They use no indices, neither of the residual nor of the finished fields that are rendered in its renders."""
+    listed: list[str] = []  # functions in which indices were listed
+    nonzero = Tensor.nonzero
+
+    def counted(tensor: Tensor, *args: Any, **options: Any) -> Any:
+        frame = sys._getframe()
+        while frame is not None:
+            listed.append(frame.f_code.co_name)
+            frame = frame.f_back
+        return nonzero(tensor, *args, **options)
+
+    monkeypatch.setattr(Tensor, "nonzero", counted)
+    run_residuals(STUBS["fastgs"], scene, tmp_path / "run", joint=1.0)
+    assert "render_fastgs" in listed, "reports of the loop's renders"
+    assert "compute_gaussian_score_fastgs" not in listed
 
 
 @pytest.mark.parametrize("name", NAMES)

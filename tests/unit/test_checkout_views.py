@@ -299,7 +299,7 @@ def test_renders_within_a_render_list_no_gaussians_where_only_their_image_is_use
 ) -> None:
     """As those of joint training; a renderer that calls another one may use its indices."""
     module, rows, stages, shown = load_module(LOOP), VisibleRows(), Stages(), []
-    rows.note_loop(module.training, {"render"}, {})
+    rows.note_caller(module.training, {"render"}, {})
     wrapper = RasterizerWrapper(stages, rows=rows)
     module.render = render = wrapper.renderer(module.render)  # type: ignore[attr-defined]
     radii = torch.tensor([0, 2, 0, 1])

@@ -99,7 +99,7 @@ def _changed(module: ModuleType) -> SimpleNamespace:
     """Return the functions of a module as `lapgs run` changes them."""
     rows = VisibleRows()
     methods = {"add_densification_stats": module.Model.add_densification_stats}
-    rows.note_loop(module.training, {"render"}, methods)
+    rows.note_caller(module.training, {"render"}, methods)
     loop = rows.updating(module.training, methods)
     model = type("Model", (module.Model,), {})
     model.add_densification_stats = rows.updating(module.Model.add_densification_stats)  # type: ignore[attr-defined]
@@ -363,3 +363,32 @@ def test_where_masks_take_the_places_of_indices(lines: str, statistics: str, exp
     assert isinstance(training, ast.FunctionDef)
     assert isinstance(method, ast.FunctionDef)
     assert keeps_masks(training, {"render"}, {method.name: method}) == expected
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ('total += render(view)["image"].mean()', True),
+        ('package = render(view)\ntotal += package["image"].mean()', True),
+        ('package = render(view)\ntotal += package["visibility_filter"].sum()', False),
+        ("package = render(view)\nreturn package", False),
+    ],
+)
+def test_score_functions_that_list_no_gaussians(lines: str, expected: bool) -> None:
+    body = "".join(f"    {line}\n" for line in lines.splitlines())
+    function = ast.parse(f"def score(view, total):\n{body}").body[0]
+    assert isinstance(function, ast.FunctionDef)
+    assert keeps_masks(function, {"render"}, {}) == expected
+
+
+def test_indices_that_a_renderer_uses_itself_stay(load_module: Callable[[str], ModuleType]) -> None:
+    source = """
+def render(radii):
+    shown = (radii > 0).nonzero()
+    return {"visibility_filter": shown, "first": shown[0, 0]}
+"""
+    render = load_module(source).render
+    radii = torch.tensor([0, 2, 0, 1])
+    results = VisibleRows().in_renderer(render, lambda: True)(radii)
+    assert results["visibility_filter"].tolist() == [[1], [3]]
+    assert results["first"] == 1
