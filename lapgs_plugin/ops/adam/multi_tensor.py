@@ -7,6 +7,7 @@ that a field's positions leave most of a GPU idle, and its Python takes as long 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any
 
 import torch
@@ -34,9 +35,12 @@ class MultiTensorAdam(torch.optim.Adam):
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Step all tensors that have a gradient, after `closure`, whose result is returned."""
-        own = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
-        hooks = own or _global_optimizer_pre_hooks or _global_optimizer_post_hooks
-        return self._watched_step(closure) if hooks or profiler._is_profiler_enabled else self._step(closure)
+        if profiler._is_profiler_enabled or self._optimizer_step_pre_hooks or _global_optimizer_pre_hooks:
+            return self._watched_step(closure)
+        loss = self._step(closure)
+        for hook in chain(self._optimizer_step_post_hooks.values(), _global_optimizer_post_hooks.values()):
+            hook(self, (self, closure), {})
+        return loss
 
     step.hooked = True  # type: ignore[attr-defined]  # as PyTorch marks it, which else calls hooks twice
 
