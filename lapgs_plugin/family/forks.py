@@ -6,6 +6,7 @@ Each class is the `GaussianRasterizer` of a variant; see `variants.Variant.bindi
 from __future__ import annotations
 
 import math
+import weakref
 from collections import deque
 from functools import lru_cache
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from lapgs_plugin.family.binding import Rasterizer, WholeSh, gather
 from lapgs_plugin.family.call import Blending, Inputs, Options, Output, ShParts, depths_of
 from lapgs_plugin.family.engine import rasterize
 from lapgs_plugin.gpu_raster.arriving_number import ArrivingNumber
+from lapgs_plugin.gpu_raster.records import state_of
 from lapgs_plugin.reference_raster.covariance import covariances_of, matrices
 from lapgs_plugin.reference_raster.oracle import rotation_matrices
 
@@ -184,21 +186,36 @@ class MipSplatting(WholeSh):
         return super()._render(inputs._replace(means2d=four))
 
 
-_arriving: deque[ArrivingNumber] = deque()
-"""Whether pixels were moved in calls on a GPU, on its way to the processor."""
+_State = tuple[int, int]
+_arriving: deque[tuple[ArrivingNumber, weakref.ref[Tensor], _State]] = deque()
+"""Whether pixels were moved in calls on a GPU, on its way to the processor; their offsets, and the state of these."""
+_zeros: dict[int, tuple[weakref.ref[Tensor], _State]] = {}
+"""Offsets that are zero, by their `id`, with their state then. Many calls have the same ones."""
 
 
 def _require_no_offset(settings: Any) -> None:
     """Refuse pixels that are moved; on a GPU a few calls later, because asking it at once would wait for it."""
-    _arriving.append(ArrivingNumber.of(settings.subpixel_offset.any()))
+    offset: Tensor = settings.subpixel_offset
+    state = (0, 0) if offset.is_inference() else state_of(offset)
+    known = _zeros.get(id(offset))
+    if known is None or known[0]() is not offset or known[1] != state:
+        _arriving.append((ArrivingNumber.of(offset.any()), weakref.ref(offset), state))
     moved = 0
-    while _arriving and _arriving[0].has_arrived():
-        moved |= _arriving.popleft().read()
+    while _arriving and _arriving[0][0].has_arrived():
+        number, asked, state = _arriving.popleft()
+        moved |= number.read()
+        if not moved and (zeros := asked()) is not None and not zeros.is_inference():
+            _note_zeros(zeros, state)
     if moved:
         raise UserInputError(
             "our version of Mip-Splatting's rasterizer has no subpixel_offset, expected all zeros; leave out "
             "--ray_jitter, or train with its own CUDA extension"
         )
+
+
+def _note_zeros(offset: Tensor, state: _State) -> None:
+    key = id(offset)
+    _zeros[key] = weakref.ref(offset, lambda _: _zeros.pop(key, None)), state
 
 
 class _Padded(torch.autograd.Function):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -171,6 +172,16 @@ def test_mip_splatting_dims_as_graphdeco_does_and_sums_absolute_gradients() -> N
             activated(case),
             **(more | {"subpixel_offset": torch.ones(1)}),
         )
+
+
+def test_mip_splatting_refuses_offsets_whenever_they_are_not_zero() -> None:
+    """It remembers offsets that were zero, and no others."""
+    case, offset = small_case(), torch.zeros(41, 53, 2)
+    more: dict[str, Any] = {"kernel_size": 0.3, "subpixel_offset": offset}
+    for moved in (0.0, 0.0, 0.5, 0.5, 0.0, 0.5):
+        offset.fill_(moved)
+        with pytest.raises(UserInputError, match="ray_jitter") if moved else nullcontext():
+            call(module_of("mip-splatting"), "mip-splatting", case, activated(case), **more)
 
 
 def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
