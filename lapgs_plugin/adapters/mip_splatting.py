@@ -81,3 +81,11 @@ class Adapter(BackboneAdapter):
         # Training computes the filters; archived fields have them applied.
         setattr(gaussians, FILTER, torch.zeros(1, 1, device="cuda"))
         return gaussians
+
+    def model_of(self, call: TrainingCall, field: GaussianField) -> Any:
+        import torch
+
+        gaussians = super().model_of(call, field)
+        # Our kernels read one for each Gaussian, which joint training would else make in each iteration.
+        setattr(gaussians, FILTER, torch.zeros(len(field), 1, device="cuda"))
+        return gaussians
