@@ -91,7 +91,7 @@ def test_events_are_in_the_file_once_after_a_write_that_was_ended(
     opened = Path.open
 
     def open_ending(self: Path, mode: str) -> Any:
-        stream: Any = opened(self, mode, buffering=0)  # type: ignore[call-overload]
+        stream: Any = opened(self, mode, buffering=0)
         return _Ending(stream, share)
 
     with monkeypatch.context() as patched:
