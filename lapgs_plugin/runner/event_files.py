@@ -7,13 +7,20 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 LONGEST = 256
 """Bytes of an event whose checksum is computed beside those of others; scalars have about 60."""
+
+
+class _Pending(NamedTuple):
+    """Hold events that are not in the file yet, and the size of the file without them."""
+
+    start: int
+    events: list[bytes]
 
 
 class EventFile:
@@ -29,8 +36,8 @@ class EventFile:
     """
 
     def __init__(self, path: Path, folder: str, gathers: Callable[[], bool]) -> None:
-        self._path, self._folder, self._gathers = path, folder, gathers
-        self._events: list[bytes] = []
+        self._path, self._folder, self._gathers = path.absolute(), folder, gathers  # the script may change its folder
+        self._pending = _Pending(path.stat().st_size, [])
         self._scalars: dict[str, tuple[Any, Any]] = {}  # by tag an event, and the value in it
         self._lock = threading.Lock()  # scripts may log in several threads
 
@@ -40,7 +47,7 @@ class EventFile:
 
     def add_event(self, event: Any) -> None:
         """Add an event."""
-        self._events.append(event.SerializeToString())
+        self._add(event)
         if not self._gathers():
             self.flush()
 
@@ -48,7 +55,11 @@ class EventFile:
         """Add the event that a `SummaryWriter` makes of a number; `flush` writes it."""
         event, value = self._scalars.get(tag) or self._add_tag(tag)
         event.step, event.wall_time, value.simple_value = step, walltime, number
-        self._events.append(event.SerializeToString())
+        self._add(event)
+
+    def _add(self, event: Any) -> None:
+        with self._lock:
+            self._pending.events.append(event.SerializeToString())
 
     def _add_tag(self, tag: str) -> tuple[Any, Any]:
         from tensorboard.compat.proto.event_pb2 import Event
@@ -61,11 +72,15 @@ class EventFile:
     def flush(self) -> None:
         """Write all events to the file."""
         with self._lock:
-            if not (events := tuple(self._events)):
+            start, events = self._pending
+            if not events:
                 return
+            records = b"".join(map(_record, events, checksums(events)))
             with self._path.open("ab") as file:
-                file.write(b"".join(map(_record, events, checksums(events))))
-            del self._events[: len(events)]  # not before they are in the file: a signal may end this function
+                if file.tell() > start:  # a signal or a full disk ended this function, which wrote some of them
+                    file.truncate(start)
+                file.write(records)
+            self._pending = _Pending(start + len(records), [])
 
     close = flush
 

@@ -58,7 +58,8 @@ class LateScalars:
         try:
             yield
         except BaseException:
-            with suppress(RuntimeError):  # a GPU that failed has no numbers, and its own error is the one to see
+            # A GPU that failed has no numbers, and a full disk takes none: the first error is the one to see.
+            with suppress(RuntimeError, OSError):
                 self._finish()
             raise
         self._finish()

@@ -28,6 +28,7 @@ from lapgs_plugin.checkouts.screen_points import POINTS, SETTINGS_ZEROS, ScreenP
 from lapgs_plugin.checkouts.whole_sh import SH, WHOLE, WholeSh, joined_attributes
 from lapgs_plugin.family.binding import Rasterizer
 from lapgs_plugin.family.call import ShParts
+from lapgs_plugin.gpu_raster.records import state_of
 from lapgs_plugin.runner.running_stage import Stages
 from lapgs_plugin.runner.signed_calls import signed_settings
 from lapgs_plugin.runner.stage_rendering import KeptZeros
@@ -260,9 +261,9 @@ class RasterizerWrapper:
         kept = self._kept if rendering is None else rendering.kept
         asked = [make, [(a.shape, a.dtype, a.device) if isinstance(a, Tensor) else a for a in args], kwargs]
         last = kept.get(name)
-        if last is None or last.asked != asked or last.zeros._version != last.version:
+        if last is None or last.asked != asked or state_of(last.zeros) != last.state:
             zeros = make(*args, **kwargs).detach()
-            last = kept[name] = KeptZeros(asked, zeros, zeros._version)
+            last = kept[name] = KeptZeros(asked, zeros, state_of(zeros))
         return last.zeros
 
     def _zero_background(self, like: Tensor) -> Tensor:

@@ -56,12 +56,12 @@ class KeptZeros:
     Attributes:
         asked: the function that makes them, and its arguments.
         zeros: on the device.
-        version: PyTorch's, by which it is seen whether they were written.
+        state: `state_of` them, by which it is seen whether they were written or got other memory.
     """
 
     asked: list[Any]
     zeros: Tensor
-    version: int
+    state: tuple[int, int]
 
 
 @dataclass

@@ -166,3 +166,16 @@ def test_an_error_of_the_gpu_is_seen(tmp_path: Path) -> None:
 
     with pytest.raises(RuntimeError, match="the first"):
         log_and_raise([tmp_path], fail, RuntimeError("CUDA error: the first"))
+
+
+def test_the_first_error_is_seen_where_the_file_takes_no_more(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with late():
+            SummaryWriter(str(tmp_path)).add_scalar("loss", 1.0, 1)
+            (file,) = tmp_path.iterdir()
+            file.unlink()
+            file.mkdir()  # cannot be written to
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()

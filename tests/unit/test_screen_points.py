@@ -165,5 +165,7 @@ def render(size):
         assert (settings[0] is settings[1]) == ours
     settings[2].add_(1)
     assert not render(5).mask.any(), "made again once it was written"
+    render(5).mask.data = torch.ones(5, dtype=torch.int)
+    assert not render(5).mask.any(), "made again once it has other memory"
     with torch.inference_mode():
         assert not render(6).mask.any()
