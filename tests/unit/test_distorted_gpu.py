@@ -68,7 +68,8 @@ def test_gsplat_renders_as_the_cpu(lens: str, degree: int, signed: bool, unit: f
     )
     difference = (ours[0] - theirs[0]).abs()
     assert ours[0].amax() - ours[0].amin() > 0.1
-    assert difference.mean() < 1e-4  # float32 turns comparisons with 1/255 and 1e-4 in a few pixels
+    # float32 turns comparisons with 1/255 and 1e-4 in a few pixels. Worst seen: 1.1e-5, 0.0082 and below 0.0063.
+    assert difference.mean() < 1e-4
     assert (difference > 0.01).double().mean() < 1e-3
     assert len(ours[1]) == len(theirs[1]) == 6
     for mine, gsplats in zip(ours[1], theirs[1], strict=True):
