@@ -71,7 +71,7 @@ class StartOptions:
         if self.gpus is not None and self.processes is not None:
             raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
         if self.tiling.asked is not None:
-            asked = {"--shard": self.shard, "--view": self.viewing.view}
+            asked: dict[str, int | bool | None] = {"--shard": self.shard, "--view": self.viewing.view}
             if self.tiling.tile is not None or self.tiling.only_base:
                 asked |= {"--gpus": self.gpus, "--processes": self.processes}
             for name, value in asked.items():
