@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +17,10 @@ from lapgs_plugin.cli import app
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import EXPOSURE, PLY, TILE_LOG, TILES
+from lapgs_plugin.runs.layout import CHECKPOINT, EXPOSURE, HISTORY, PLY, TILE_LOG, TILES
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.tiles.grid import read_grid
+from tests.waiting import wait_for
 
 OPTIONS = ("--iterations", "40", "--sh-degree", "1", "--hierarchy", "nested", "--eval", "--appearance", "affine")
 TILE_FOLDERS = ("tile_0_0", "tile_0_1")
@@ -122,6 +125,24 @@ def test_a_failed_tile_is_named_and_continued(tmp_path: Path, scene: Path, lapgs
     assert "tile 0,1 failed" in messages
     assert str(run / "tile_0_1" / TILE_LOG) in messages
     stranger.unlink()
+    lapgs("train", scene, "-o", run, "--resume", "--processes", "2")
+    assert RunArchive.open(run).manifest.complete
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
+def test_sigterm_reaches_running_tiles_which_write_checkpoints(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    longer = (*OPTIONS, "--iterations", "400")
+    lapgs("train", scene, "-o", run, *longer, "--tiles", "1x2", "--only-base")
+    command = [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, "--resume", "--processes", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as parent:
+        histories = [run / folder / HISTORY for folder in TILE_FOLDERS]
+        wait_for(lambda: all(path.exists() and path.stat().st_size for path in histories))
+        parent.send_signal(signal.SIGTERM)
+        messages = parent.communicate()[1]
+    assert parent.returncode == 143, messages
+    assert "stopped by SIGTERM; running tiles have checkpoints" in messages
+    assert all((run / folder / CHECKPOINT).exists() for folder in TILE_FOLDERS)
     lapgs("train", scene, "-o", run, "--resume", "--processes", "2")
     assert RunArchive.open(run).manifest.complete
 
