@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from contextlib import ExitStack
@@ -22,7 +23,7 @@ from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option
-from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
+from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD, TILES
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.tiles.options import TileOptions, require_options_of_base
@@ -30,6 +31,7 @@ from lapgs_plugin.training.ranks import launcher
 from lapgs_plugin.training.settings import TrainingControl, TrainSettings
 
 if TYPE_CHECKING:
+    from lapgs_plugin.tiles.workers import Workers
     from lapgs_plugin.training.monitor import Monitor
     from lapgs_plugin.training.preparation import TrainRequest
     from lapgs_plugin.training.prepared_run import PreparedRun
@@ -49,8 +51,8 @@ class StartOptions:
     overwrite: bool = option(False, "Replace the run in --out.")
     gpus: int | None = option(
         None,
-        "Train on this many GPUs of the machine, which share the views of each step; see `lapgs help scale`. torchrun "
-        "-m lapgs_plugin train does the same, also on several machines.",
+        "Train on this many GPUs of the machine, which share the views of each step, or with --tiles the tiles; see "
+        "`lapgs help scale`. torchrun -m lapgs_plugin train does the same, also on several machines.",
         least=1,
         most=1024,
     )
@@ -69,12 +71,9 @@ class StartOptions:
         if self.gpus is not None and self.processes is not None:
             raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
         if self.tiling.asked is not None:
-            asked = {
-                "--gpus": self.gpus,
-                "--processes": self.processes,
-                "--shard": self.shard,
-                "--view": self.viewing.view,
-            }
+            asked: dict[str, int | bool | None] = {"--shard": self.shard, "--view": self.viewing.view}
+            if self.tiling.tile is not None or self.tiling.only_base:
+                asked |= {"--gpus": self.gpus, "--processes": self.processes}
             for name, value in asked.items():
                 if value:
                     raise UserInputError(f"{name} with {self.tiling.asked}: not for tiles; leave one out")
@@ -90,6 +89,27 @@ class StartOptions:
             )
         if self.viewing.view:
             raise UserInputError("--view with --shard: no rank has all of the Gaussians to show; leave one out")
+
+    def workers(self, rasterizer: str) -> Workers | None:
+        """Return what trains tiles at the same time; None trains them one after the other.
+
+        Args:
+            rasterizer: that is asked for.
+
+        Raises:
+            UserInputError: the machine has not as many GPUs, or torchrun started this process.
+        """
+        from lapgs_plugin.tiles.workers import Workers
+
+        if launcher.is_rank():
+            raise UserInputError("torchrun with --tiles: tiles are no ranks; start it by lapgs train with --gpus")
+        if self.processes is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = ""
+            return Workers.on_cpus(self.processes)
+        if self.gpus is None:
+            return None
+        launcher.require_gpus(self.gpus, rasterizer)
+        return Workers.on_gpus(self.gpus)
 
     def launches(self, rasterizer: str) -> bool:
         """Run this command on several ranks if that is asked for; return whether it has.
@@ -146,12 +166,13 @@ def train(
 
         lapgs train --config runs/garden/run.toml -o runs/again --seed 1
 
-        lapgs train data/town -o runs/town --hierarchy nested --tiles 2x3
+        lapgs train data/town -o runs/town --hierarchy nested --tiles 2x3 --gpus 4
     """
     from lapgs_plugin.training.preparation import TrainRequest, prepare
     from lapgs_plugin.training.ranks.group import joined
 
-    if not isinstance(context.obj, Rehearsal) and start.launches(control.rasterizer):
+    in_tiles = start.tiling.asked is not None or (start.resume and (out / TILES).exists())
+    if not isinstance(context.obj, Rehearsal) and not in_tiles and start.launches(control.rasterizer):
         return
     if leads := launcher.leads():
         log_to_stderr("%(message)s")
@@ -168,7 +189,7 @@ def train(
     )
     if isinstance(context.obj, float):
         request = replace(request, began=context.obj)
-    if not isinstance(context.obj, Rehearsal) and _trained_in_tiles(context, request, start.tiling):
+    if not isinstance(context.obj, Rehearsal) and _trained_in_tiles(context, request, start):
         return
     viewing = start.viewing if leads else ViewOptions()
     watcher = context.with_resource(watching(viewing, out.absolute().name))
@@ -211,7 +232,7 @@ def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str 
     return None
 
 
-def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: TileOptions) -> bool:
+def _trained_in_tiles(context: typer.Context, request: TrainRequest, start: StartOptions) -> bool:
     """Train a run in tiles, or one tile, if that is asked for or was begun; return whether it was.
 
     Raises:
@@ -219,8 +240,10 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: Til
     """
     from lapgs_plugin.runs.layout import require_room
     from lapgs_plugin.tiles.grid import has_grid, read_grid
-    from lapgs_plugin.tiles.run import Tile, train_tile, train_tiles
+    from lapgs_plugin.tiles.run import train_tile, train_tiles
+    from lapgs_plugin.tiles.tile import Tile
 
+    tiling = start.tiling
     out, scene, tell = Path(request.out), Path(request.scene), partial(say, stderr=True)
 
     def started(run: PreparedRun, finest: int) -> None:
@@ -242,8 +265,13 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, tiling: Til
         )
     if tiling.tiles is None and not continues:
         return False
+    if start.shard:
+        raise UserInputError(f"--shard: {out} is made of tiles, which are not divided further; leave it out")
     shape = None if tiling.tiles is None else tiling.shape
-    if train_tiles(request, shape, started, tell, queue=say if tiling.only_base else None):
+    queue, workers = say if tiling.only_base else None, start.workers(request.control.rasterizer)
+    if workers is not None:
+        tell("the coarser levels are trained by one process; then the tiles at the same time")
+    if train_tiles(request, shape, started, tell, queue=queue, workers=workers):
         _save_preview(out, scene)
         _say_what_is_next(out)
     return True

@@ -54,7 +54,7 @@ HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 CAMERAS, VIGNETTING = "view_cameras.json", "vignetting.json"
-TILES, TILE = "tiles.json", "tile_{}_{}"
+TILES, TILE, TILE_LOG = "tiles.json", "tile_{}_{}", "train.log"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
 GRIDS = "view_grids.pt"
@@ -85,8 +85,8 @@ def require_room(path: Path | str, overwrite: bool = False, since: int | None = 
         return
     with one_line_errors(folder, "read"):
         entries = list(folder.iterdir()) if folder.exists() else []
-    # A run that was killed before its first manifest leaves these two.
-    others = [p for p in entries if p.name != LOCK and not p.match(TEMPORARY_PATTERN)]
+    # A run that was killed before its first manifest leaves these; whoever starts a tile's run opens its log before.
+    others = [p for p in entries if p.name not in (LOCK, TILE_LOG) and not p.match(TEMPORARY_PATTERN)]
     with one_line_errors(folder, "read"):
         strangers = [p.name for p in others if since is None or _oldest(p) < since]
     if strangers:
@@ -208,10 +208,12 @@ def remove_results(folder: Path) -> None:
                 waiting.unlink()
         if not any(level.iterdir()):
             level.rmdir()
-    for tile in filter(is_run, folder.glob(f"{TILE.format('*', '*')}/")):
-        remove_results(tile)
-        for name in (CHECKPOINT, MANIFEST, LOCK):
-            (tile / name).unlink(missing_ok=True)
+    for tile in folder.glob(f"{TILE.format('*', '*')}/"):
+        (tile / TILE_LOG).unlink(missing_ok=True)
+        if is_run(tile):
+            remove_results(tile)
+            for name in (CHECKPOINT, MANIFEST, LOCK):
+                (tile / name).unlink(missing_ok=True)
         if not any(tile.iterdir()):
             tile.rmdir()
 

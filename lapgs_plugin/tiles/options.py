@@ -26,9 +26,9 @@ class TileOptions:
 
     tiles: str | None = option(
         None,
-        "Train the coarser levels once, then the finest one in tiles of the scene's ground, one after the other, and "
-        "merge them into one run: RxC, rows and columns, the longer side of the scene cut into columns; auto, by the "
-        "number of photos. With --hierarchy nested; see `lapgs help scale`.",
+        "Train the coarser levels once, then the finest one in tiles of the scene's ground, one after the other or on "
+        "--gpus at the same time, and merge them into one run: RxC, rows and columns, the longer side of the scene cut "
+        "into columns; auto, by the number of photos. With --hierarchy nested; see `lapgs help scale`.",
         panel=PANEL,
         metavar="RxC",
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,9 @@ from lapgs_plugin.runs.manifest import LevelRecord, SceneReference
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.tiles.grid import TileGrid, has_grid, read_grid
 from lapgs_plugin.tiles.options import require_tileable
+from lapgs_plugin.tiles.tile import Tile
 from lapgs_plugin.tiles.visibility import TileViews, views_of_tile
+from lapgs_plugin.tiles.workers import Workers, train_apart
 from lapgs_plugin.training.backend import training_rasterizer
 from lapgs_plugin.training.checkpoint import check_moments
 from lapgs_plugin.training.preparation import Say, TrainRequest, prepare
@@ -42,39 +43,13 @@ Train = Callable[[PreparedRun, int], None]
 """Trains a run down to a level."""
 
 
-@dataclass(frozen=True)
-class Tile:
-    """Name a tile of a run.
-
-    Attributes:
-        base: folder of the run whose coarser levels it shares.
-        scene: folder of the scene, now.
-        place: row and column.
-    """
-
-    base: Path
-    scene: Path
-    place: tuple[int, int]
-
-    @property
-    def folder(self) -> Path:
-        """Where its run is expected."""
-        return self.base / TILE.format(*self.place)
-
-    @property
-    def name(self) -> str:
-        """Row and column as --tile takes them."""
-        return f"{self.place[0]},{self.place[1]}"
-
-    @property
-    def command(self) -> str:
-        """The command that trains it alone."""
-        scene, base, folder = (shlex.quote(str(path)) for path in (self.scene, self.base, self.folder))
-        return f"lapgs train {scene} --tile {self.name} --base {base} -o {folder}"
-
-
 def train_tiles(
-    request: TrainRequest, shape: tuple[int, int] | None, train: Train, say: Say, queue: Say | None = None
+    request: TrainRequest,
+    shape: tuple[int, int] | None,
+    train: Train,
+    say: Say,
+    queue: Say | None = None,
+    workers: Workers | None = None,
 ) -> bool:
     """Train a run in tiles, or continue it: what is finished already is left as it is. Return whether it is complete.
 
@@ -84,6 +59,7 @@ def train_tiles(
         train: trains the base and each tile.
         say: shows a line to the user.
         queue: takes the command of each tile, which is not trained here then; None trains and merges them.
+        workers: train tiles at the same time, each in a process of its own; None trains one after the other, here.
 
     Raises:
         UserInputError: no tile is seen by enough views.
@@ -109,9 +85,13 @@ def train_tiles(
     tiles = [Tile(out, scene, place) for place in grid]
     if queue is not None:
         for tile in tiles:
-            queue(tile.command)
+            queue(tile.command(request.control))
         return False
-    unseen = {tile.place for tile in tiles if not train_tile(tile, tile.folder, request.control, train, say)}
+    if workers is None:
+        unseen = {tile.place for tile in tiles if not train_tile(tile, tile.folder, request.control, train, say)}
+    else:
+        train_apart([tile for tile in tiles if not _is_complete(tile)], workers, request.control)
+        unseen = {tile.place for tile in tiles if not is_run(tile.folder)}
     if len(unseen) == len(tiles):
         raise UserInputError(
             f"{out}: fewer than {LEAST_VIEWS} training views see each of its {grid.text} tiles, so that nothing was "
@@ -119,6 +99,11 @@ def train_tiles(
         )
     _merge(out, grid, unseen)
     return True
+
+
+def _is_complete(tile: Tile) -> bool:
+    """Return whether a tile is trained already."""
+    return is_run(tile.folder) and RunArchive.open(tile.folder).manifest.complete
 
 
 def train_tile(
@@ -155,7 +140,7 @@ def train_tile(
         return False
     say(
         f"tile {tile.name} of {grid.text}: {counted(len(seen.masks), 'view')}, {seen.share:.0%} of their pixels; "
-        f"alone: {tile.command}"
+        f"alone: {tile.command(control)}"
     )
     settings = settings_from_manifest(base.manifest, str(base.path()))
     photos = _options_of(base.manifest.scene)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +17,10 @@ from lapgs_plugin.cli import app
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
-from lapgs_plugin.runs.layout import EXPOSURE, PLY, TILES
+from lapgs_plugin.runs.layout import CHECKPOINT, EXPOSURE, HISTORY, PLY, TILE_LOG, TILES
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.tiles.grid import read_grid
+from tests.waiting import wait_for
 
 OPTIONS = ("--iterations", "40", "--sh-degree", "1", "--hierarchy", "nested", "--eval", "--appearance", "affine")
 TILE_FOLDERS = ("tile_0_0", "tile_0_1")
@@ -45,7 +48,7 @@ def lapgs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
             app.run()
         printed = capsys.readouterr()
         assert ended.value.code == (2 if fails else 0), printed.err
-        return printed.out if "--only-base" in words else printed.err
+        return printed.out if "--only-base" in words and not fails else printed.err
 
     return call
 
@@ -101,6 +104,49 @@ def test_tiles_end_as_one_run(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None
     assert fields_of(run) == finished
 
 
+def test_tiles_at_the_same_time_have_the_bits_of_one_after_the_other(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    one, several = tmp_path / "one", tmp_path / "several"
+    lapgs("train", scene, "-o", one, *OPTIONS, "--tiles", "1x2")
+    messages = lapgs("train", scene, "-o", several, *OPTIONS, "--tiles", "1x2", "--processes", "3")
+    assert "Tiles 2 of 2 tiles" in messages
+    assert fields_of(several) == fields_of(one)
+    assert all("tile 0," in (several / folder / TILE_LOG).read_text() for folder in TILE_FOLDERS)
+
+
+def test_a_failed_tile_is_named_and_continued(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    command = ("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2")
+    printed = lapgs(*command, "--only-base", "--rasterizer", "cpu", "--threads", "1")
+    assert all(words[-4:] == ["--rasterizer", "cpu", "--threads", "1"] for words in tile_commands(printed))
+    stranger = run / "tile_0_1" / "stranger"
+    stranger.parent.mkdir()
+    stranger.touch()
+    messages = lapgs("train", scene, "-o", run, "--resume", "--processes", "2", fails=True)
+    assert "tile 0,1 failed" in messages
+    assert str(run / "tile_0_1" / TILE_LOG) in messages
+    stranger.unlink()
+    lapgs("train", scene, "-o", run, "--resume", "--processes", "2")
+    assert RunArchive.open(run).manifest.complete
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
+def test_sigterm_reaches_running_tiles_which_write_checkpoints(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    longer = (*OPTIONS, "--iterations", "400")
+    lapgs("train", scene, "-o", run, *longer, "--tiles", "1x2", "--only-base")
+    command = [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, "--resume", "--processes", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as parent:
+        histories = [run / folder / HISTORY for folder in TILE_FOLDERS]
+        wait_for(lambda: all(path.exists() and path.stat().st_size for path in histories))
+        parent.send_signal(signal.SIGTERM)
+        messages = parent.communicate()[1]
+    assert parent.returncode == 143, messages
+    assert "stopped by SIGTERM; running tiles have checkpoints" in messages
+    assert all((run / folder / CHECKPOINT).exists() for folder in TILE_FOLDERS)
+    lapgs("train", scene, "-o", run, "--resume", "--processes", "2")
+    assert RunArchive.open(run).manifest.complete
+
+
 def test_a_tile_without_views_keeps_the_base(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
     run = tmp_path / "run"
     lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2", "--only-base")
@@ -128,7 +174,9 @@ def test_bad_requests(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
     run, other, out = tmp_path / "run", tmp_path / "other", tmp_path / "out"
     assert "--hierarchy nested" in lapgs("train", scene, "-o", out, "--tiles", "1x2", fails=True)
     assert "--levels 1" in lapgs("train", scene, "-o", out, *OPTIONS, "--levels", "1", "--tiles", "1x2", fails=True)
-    assert "--gpus" in lapgs("train", scene, "-o", out, *OPTIONS, "--tiles", "1x2", "--gpus", "2", fails=True)
+    tiles = ("train", scene, "-o", out, *OPTIONS, "--tiles", "1x2")
+    assert "--gpus 99" in lapgs(*tiles, "--gpus", "99", fails=True)
+    assert "--processes" in lapgs(*tiles, "--only-base", "--processes", "2", fails=True)
     assert "--refine-poses" in lapgs(
         "train", scene, "-o", out, *OPTIONS, "--tiles", "2x1", "--refine-poses", fails=True
     )

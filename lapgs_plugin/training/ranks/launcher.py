@@ -9,12 +9,14 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -25,6 +27,8 @@ from lapgs_plugin.limits import usable_processors
 
 REPORTS = "LAPGS_RANK_REPORTS"
 """Environment variable with the folder into which ranks write how they ended."""
+STOPPED = (130, 143)
+"""Exit codes after Ctrl-C and SIGTERM."""
 GRACE = 20.0
 """Seconds that a rank has to end after a signal: it may wait in a GPU's queue for a rank that is gone."""
 POLL = 0.2
@@ -87,7 +91,8 @@ def end_rank(error: BaseException, text: str, code: int) -> NoReturn:
 
     if (folder := os.environ.get(REPORTS)) is not None:
         report = {"text": text, "code": code, "lost": isinstance(error, RankLostError)}
-        (Path(folder) / os.environ["RANK"]).write_text(json.dumps(report), encoding="utf-8")
+        with suppress(FileNotFoundError):  # removed: nobody is left to read it
+            (Path(folder) / os.environ["RANK"]).write_text(json.dumps(report), encoding="utf-8")
     elif leads():
         print(text, file=sys.stderr)
     sys.stdout.flush()
@@ -115,6 +120,8 @@ def _stop_without_agent() -> None:
     agent = os.getppid()
     while os.getppid() == agent:
         time.sleep(POLL)
+    if (folder := os.environ.get(REPORTS)) is not None:
+        shutil.rmtree(folder, ignore_errors=True)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -199,7 +206,9 @@ def _end(reports: Mapping[int, Report], failures: Mapping[int, int], count: int)
     killed = [(rank, -code) for rank, code in sorted(failures.items()) if rank >= 0 > code]
     if causes:
         report = causes[0]
-        code = 128 + stopped if stopped and report.code == 130 else report.code
+        # Ranks agree to stop: only the one that was signalled knows by what.
+        by_signals = [128 + stopped] if stopped else [each.code for each in causes if each.code in STOPPED]
+        code = max(by_signals) if report.code in STOPPED else report.code
     elif stopped:
         interrupt.stop_by(stopped)
     elif killed:
