@@ -132,7 +132,7 @@ def test_a_failed_tile_is_named_and_continued(tmp_path: Path, scene: Path, lapgs
 @pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
 def test_sigterm_reaches_running_tiles_which_write_checkpoints(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
     run = tmp_path / "run"
-    longer = (*OPTIONS, "--iterations", "400")
+    longer = (*OPTIONS, "--iterations", "1200")  # so that no tile ends before the other has begun
     lapgs("train", scene, "-o", run, *longer, "--tiles", "1x2", "--only-base")
     command = [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, "--resume", "--processes", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as parent:
