@@ -122,9 +122,10 @@ class TrainingCall:
         variables = getattr(inspect.unwrap(self.function), "__globals__", {})
         return [value for value in (*variables.values(), *self.values.values()) if isinstance(value, Namespace)]
 
-    def having(self, option: str) -> list[Any]:
-        """Return the parsed options and the arguments that have an option."""
-        return [group for group in (*self._parsed, *self.values.values()) if hasattr(group, option)]
+    @property
+    def options(self) -> list[Any]:
+        """The script's parsed options and the arguments, whatever they have; some are in it twice."""
+        return [*self._parsed, *self.values.values()]
 
     @property
     def white_background(self) -> bool:

@@ -23,7 +23,7 @@ from lapgs_plugin.errors import UserInputError, printable
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.options import option
-from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD, TILES
+from lapgs_plugin.runs.layout import RUN_CONFIG, TENSORBOARD
 from lapgs_plugin.runs.watcher import Watcher
 from lapgs_plugin.scenes.options import SceneOptions
 from lapgs_plugin.tiles.options import TileOptions, require_options_of_base
@@ -168,10 +168,11 @@ def train(
 
         lapgs train data/town -o runs/town --hierarchy nested --tiles 2x3 --gpus 4
     """
+    from lapgs_plugin.tiles.grid import has_grid
     from lapgs_plugin.training.preparation import TrainRequest, prepare
     from lapgs_plugin.training.ranks.group import joined
 
-    in_tiles = start.tiling.asked is not None or (start.resume and (out / TILES).exists())
+    in_tiles = start.tiling.asked is not None or (start.resume and has_grid(out))
     if not isinstance(context.obj, Rehearsal) and not in_tiles and start.launches(control.rasterizer):
         return
     if leads := launcher.leads():

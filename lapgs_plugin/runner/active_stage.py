@@ -34,7 +34,7 @@ from lapgs_plugin.runner.stage_rendering import StageRendering
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runner.step_clock import CLOCK
 from lapgs_plugin.runs.profiling import Breakdown, breakdown_on
-from lapgs_plugin.stages.opacity_weight import OPTION, OpacityWeight
+from lapgs_plugin.stages.opacity_weight import OpacityWeight
 from lapgs_plugin.stages.record import StageRecord
 
 logger = logging.getLogger(__name__)
@@ -82,8 +82,7 @@ class ActiveStage(RunningStage):
         self._joint_count = 0  # Gaussians of finished fields that are trained jointly
         self._prune_at = pruning_iteration(self._call) if self._options.prune else None
         until = min(getattr(call.opt, "densify_until_iter", self.stage.iterations), self.stage.iterations)
-        weighing = call.having(OPTION) if self.stage.signed else []
-        self._opacity_weight = OpacityWeight(weighing, until)
+        self._opacity_weight = OpacityWeight(call.options if self.stage.signed else (), until)
         self.returned: Any = None
         self._diverged_at: int | None = None  # first iteration after which positions were seen not to be finite
         # Whether positions were finite after an iteration, on its way from the device: the loop runs ahead of it.
@@ -151,8 +150,7 @@ class ActiveStage(RunningStage):
             self._prune(gaussians)
         if iteration == self._joint_from:
             self._train_jointly(gaussians)
-        if self._opacity_weight:
-            self._opacity_weight.set(iteration)
+        self._opacity_weight.set(iteration)
         count = gaussians._xyz.shape[0] + self._joint_count
         self.record.count(iteration, count)
         if iteration % self.record.history_every == 0:

@@ -126,8 +126,9 @@ class StageReplacements:
         names = {name for _, name in holders} | {renderer.__name__ for renderer in profile.renderers}
         functions = [value for module, _ in holders for _, value in held_by(module) if isinstance(value, FunctionType)]
         callers: list[Callable[..., Any]] = [f for f in functions if names & set(f.__code__.co_names)]
+        methods = _statistics(profile)
         for function in dict.fromkeys([profile.training, *callers]):
-            rows.note_caller(function, names, _statistics(profile))
+            rows.note_caller(function, names, methods)
 
     def _in_scores(self, profile: Profile) -> list[Replacement]:
         """Return replacements of score functions, after the adapter's of the same functions."""

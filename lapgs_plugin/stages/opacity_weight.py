@@ -26,13 +26,9 @@ class OpacityWeight:
     """
 
     def __init__(self, options: Iterable[Any], densified_until: float) -> None:
-        weights = {id(each): (each, getattr(each, OPTION, None)) for each in options}.values()
+        weights = [(each, getattr(each, OPTION, None)) for each in options]
         self._own = [(each, weight) for each, weight in weights if isinstance(weight, float | int) and weight > 0]
         self._colorless = COLORLESS * densified_until
-
-    def __bool__(self) -> bool:
-        """Whether any options have such a weight."""
-        return bool(self._own)
 
     def set(self, iteration: int) -> None:
         """Set the weight of an iteration, from 1."""

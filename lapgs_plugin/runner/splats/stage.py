@@ -60,7 +60,7 @@ class SplatStage:
         self._items: dict[int, dict[str, Any]] = {}  # of views, without pixels
         config = self._trainer.cfg
         last = getattr(config.strategy, "refine_stop_iter", config.max_steps)
-        self._opacity_weight = OpacityWeight([config] if stage.signed else [], last)
+        self._opacity_weight = OpacityWeight((config,) if stage.signed else (), last)
         self.iteration = 0
 
     def begin(self) -> None:
@@ -109,8 +109,7 @@ class SplatStage:
             self._record.write_history(self.iteration - 1, {"elapsed": elapsed, **quality})
         if self.iteration == self._joint_from:
             self._train_jointly()
-        if self._opacity_weight:
-            self._opacity_weight.set(self.iteration)
+        self._opacity_weight.set(self.iteration)
         if self._joint and self._coarser is not None:
             count += sum(len(field.splats["means"]) for field in self._coarser.fields)
         self._record.count(self.iteration, count)

@@ -27,7 +27,7 @@ from lapgs_plugin.limits import usable_processors
 
 REPORTS = "LAPGS_RANK_REPORTS"
 """Environment variable with the folder into which ranks write how they ended."""
-STOPPED = (130, 143)
+STOPPED = tuple(128 + number for number in interrupt.SIGNALS)
 """Exit codes after Ctrl-C and SIGTERM."""
 GRACE = 20.0
 """Seconds that a rank has to end after a signal: it may wait in a GPU's queue for a rank that is gone."""
