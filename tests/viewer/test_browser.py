@@ -246,6 +246,8 @@ def test_on_a_phone_the_controls_are_opened_by_a_tap(browser: Any, address: str,
         controls = page.get_by_text("Controls", exact=True).first
         controls.wait_for(timeout=1e3 * PATIENCE)
         playwright.expect(page.get_by_text("Bands", exact=True)).not_to_be_in_viewport(timeout=1e3 * PATIENCE)
+        # The panel slides shut, and hides "Bands" before it has arrived.
+        page.wait_for_function(f"({COVERED})() < 0.25", timeout=1e3 * PATIENCE)
         covered = page.evaluate(COVERED)
         assert covered < 0.25, "most of the window shows the picture"  # seen 0.10 upright and 0.08 on its side
         controls.tap()
