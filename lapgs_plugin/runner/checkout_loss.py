@@ -17,6 +17,7 @@ from torch import Tensor
 from lapgs_plugin.checkouts.loss_statements import BACKWARD, LOSSES, LossStatements
 from lapgs_plugin.checkouts.rewriting import rewritten
 from lapgs_plugin.ops import photometric_loss
+from lapgs_plugin.ops.backward import backward
 from lapgs_plugin.ops.self_check import SelfCheck, largest
 
 NAME = "ssim"
@@ -53,16 +54,11 @@ def in_one_kernel(training: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _backward(loss: Any) -> None:
-    """Do `loss.backward()`, for which PyTorch would fill a new 1 in each iteration."""
-    if isinstance(loss, Tensor) and loss.ndim == 0 and loss.dtype == torch.float32:
-        loss.backward(_one(loss.device))  # type: ignore[no-untyped-call]  # torch's
+    """Do `loss.backward()`."""
+    if type(loss) is Tensor and loss.ndim == 0:
+        backward(loss)
     else:
         loss.backward()
-
-
-@cache
-def _one(device: torch.device) -> Tensor:
-    return torch.ones((), device=device)
 
 
 def _losses(l1: Any, ssim: Any, batched: bool, image: Any, target: Any, weight: Any) -> tuple[Tensor, Tensor] | None:

@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from lapgs_plugin.ops.adam.multi_tensor import fuse_steps
-from lapgs_plugin.ops.adam.multi_tensor import triton_works as adam_in_triton
+from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam
 
 BETAS = (0.8, 0.99)
 """Of Adam, which makes one step in each pass over the views, not one for each view."""
@@ -59,13 +58,11 @@ class ViewTransforms(ABC):
     total: int
     ranks: Processes = field(init=False, repr=False, default=Processes())  # holds nothing
     _index: dict[str, int] = field(init=False, repr=False)
-    _adam: torch.optim.Adam = field(init=False, repr=False)
+    _adam: MultiTensorAdam = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._index = {name: index for index, name in enumerate(self.names)}
-        self._adam = torch.optim.Adam([self.transforms], lr=self._rates[0], betas=BETAS, eps=self.EPSILON)
-        if adam_in_triton(self.transforms):
-            fuse_steps(self._adam)
+        self._adam = MultiTensorAdam([self.transforms], lr=self._rates[0], betas=BETAS, eps=self.EPSILON)
 
     @property
     @abstractmethod

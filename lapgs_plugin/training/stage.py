@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from itertools import chain, groupby
 from typing import Any
 
@@ -21,6 +20,7 @@ from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hierarchy.plan import Stage
 from lapgs_plugin.hooks import HookDispatcher, StageContext
 from lapgs_plugin.ops.adam import ONE_VIEW, StepScale
+from lapgs_plugin.ops.backward import backward
 from lapgs_plugin.runs.image_store import AHEAD
 from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.stages.appearance import ViewAppearance
@@ -462,8 +462,7 @@ class StageRun:
             self._require_finite_loss(kept.item(), last)
         self._breakdown.mark("backward")
         with set_multithreading_enabled(False):  # a thread of a GPU's own is waited for twice
-            # The gradient of the sum of the views' losses; for one view, the default of `backward`.
-            loss.backward(_number(len(views), kept.dtype, kept.device))  # type: ignore[no-untyped-call]  # torch's
+            backward(loss, len(views))  # the gradient of the sum of the views' losses
         if result is not None:
             scale_to_last(result, [camera.size for camera in cameras])
         self._breakdown.mark("other")
@@ -610,10 +609,3 @@ class StageRun:
             if (values := state.get(name)) is not None:
                 assert learned is not None, "the trainer looks for it"
                 learned.restore(values)
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)  # the cache serves calls that need gradients
-def _number(value: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return a number as a cached tensor, which must not be written to."""
-    return torch.full((), value, dtype=dtype, device=device)

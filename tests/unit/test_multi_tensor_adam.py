@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -194,3 +196,27 @@ def test_without_the_kernel_it_is_pytorchs_fused(monkeypatch: pytest.MonkeyPatch
     assert type(ours) is torch.optim.Adam
     assert ours.param_groups[0]["fused"] is True
     assert_same(stepped, expected)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        "GpuFieldAdam(values, 0.1)",
+        "FieldAdam([values], 0.1)",
+        "MultiTensorAdam([values], 0.1)",
+    ],
+)
+def test_no_optimizer_of_ours_imports_pytorchs_compiler(made: str) -> None:
+    """Importing it takes two seconds, more than some levels."""
+    lines = [
+        "import sys, torch",
+        "from lapgs_plugin.ops.adam import GpuFieldAdam",
+        "from lapgs_plugin.ops.adam.in_numba import FieldAdam",
+        "from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam",
+        "values = torch.nn.Parameter(torch.ones(5, 3))",
+        "values.grad = torch.ones(5, 3)",
+        f"optimizer = {made}",
+        "if not isinstance(optimizer, GpuFieldAdam): optimizer.step()",  # which `step_together` steps
+        "assert 'torch._dynamo' not in sys.modules",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, AdamSlot, step_torch
+from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, AdamSlot, PlainOptimizer, step_torch
 from lapgs_plugin.ops.self_check import largest, matches_reference
 
 __all__ = ["ADAM_EPS", "ONE_VIEW", "GpuFieldAdam", "StepScale", "step_together", "triton_works"]
@@ -43,7 +43,7 @@ class StepScale:
 ONE_VIEW = StepScale()
 
 
-class GpuFieldAdam(torch.optim.Optimizer):
+class GpuFieldAdam(PlainOptimizer):
     """Hold Adam's state of one tensor, which gsplat's strategies edit; `step_together` steps it with the others.
 
     'step' is a number: the processor knows it, and a GPU does not have to count.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -16,7 +15,7 @@ from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.jit.compiler import inline, jit
 from lapgs_plugin.jit.lanes import WIDTH, Floats, Lanes, fetch_add, load, sqrt, store
 from lapgs_plugin.jit.threads import parallel
-from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS
+from lapgs_plugin.ops.adam.in_torch import ADAM_EPS, BETAS, PlainOptimizer
 
 _FLAT_COLUMNS = 4096  # length of the rows that a parameter is cut into if all its columns are treated alike
 _TASK_ELEMENTS = 16384
@@ -70,7 +69,7 @@ def _adam_kernel(
                 p[i] = _moved(p[i], scale[x], m[i], np.sqrt(v[i]), rates)
 
 
-class FieldAdam(torch.optim.Optimizer):
+class FieldAdam(PlainOptimizer):
     """Optimize parameters of n Gaussians, (n, ...), on the CPU with the formula and the state of `torch.optim.Adam`.
 
     The state has torch's keys 'step', 'exp_avg' and 'exp_avg_sq', so densification code that edits the state of torch's
@@ -102,10 +101,6 @@ class FieldAdam(torch.optim.Optimizer):
             raise UserInputError(f"lr {lr}, eps {eps}: expected 0 or more for both")
         options = {"column_scale": column_scale, "active_columns": None, "views": 1}
         super().__init__(params, {"lr": lr, "betas": BETAS, "eps": eps, **options})
-
-    def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Add a group as torch's optimizers do, without importing torch's compiler, which would take a second."""
-        inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]  # without a closure

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,6 +31,14 @@ class AdamSlot(NamedTuple):
     step: float
     rate: float
     rest: float
+
+
+class PlainOptimizer(torch.optim.Optimizer):
+    """Add groups of parameters as PyTorch's optimizers do, without importing its compiler, which takes seconds."""
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add a group."""
+        inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
 
 @torch.no_grad()
