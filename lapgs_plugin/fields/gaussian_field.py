@@ -23,7 +23,7 @@ SIGNED_COMMENT = "lapgs_signed 1"
 """PLY comment that marks a residual field. Other viewers ignore it and show an ordinary field."""
 
 ROWS = 1 << 14
-"""Gaussians that are brought into the order of a PLY at once, 4 MB of them, so that they stay in a processor's cache."""
+"""Gaussians that are brought into the order of a PLY at once: 4 MB, which a processor's cache holds."""
 
 SH_REST_COUNTS = (0, 9, 24, 45)
 """Number of f_rest_* properties of a PLY of SH degree 0 to 3: (degree + 1)^2 - 1 for each of three channels."""
