@@ -42,7 +42,7 @@ from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.tensorboard import require_tensorboard
-from lapgs_plugin.training.time_budget import parse_duration, require_time_left
+from lapgs_plugin.training.time_budget import cost_of, parse_duration, require_time_left
 
 MAY_CHANGE = ("images_on", "prediction_precision", "time")
 """Settings that may change when a run is continued."""
@@ -212,9 +212,11 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
     ranks, seconds = request.ranks, parse_duration(settings.time)
     rate = ranks.from_leader(ranks.size * views_per_second(scene, settings, placed))
     require_time_left(settings.time, spent := ranks.from_leader(time.monotonic() - request.began))
-    iterations = max(settings.levels, round(rate * (seconds - spent)))
-    settings = settings.lasting(iterations, choose="strategy" not in request.chosen).for_size(scene.smallest_size)
-    require_pruning(make_plan(scene.smallest_size, settings, len(scene.train)), settings)
+    size = scene.smallest_size
+    split = make_plan(size, settings.for_size(size))
+    iterations = max(settings.levels, round(rate * (seconds - spent) * split.iterations / cost_of(split)))
+    settings = settings.lasting(iterations, choose="strategy" not in request.chosen).for_size(size)
+    require_pruning(make_plan(size, settings, len(scene.train)), settings)
     say(
         f"--time {settings.time}: {seconds - spent:.1f} s are left for training, about {iterations:,} iterations of "
         f"{rate:.3g} views a second measured on the points; the length of each level follows its rate"

@@ -209,6 +209,12 @@ class PreparedRun(StagedRun):
         sizes = [level_size(view.camera.size, stage.level) for view in self.scene.train]
         return self.settings.strategy_of(stage, sum(map(math.prod, sizes)))
 
+    def gaussians_to_archive(self, stage: Stage) -> int:
+        """Return how many Gaussians are archived when a stage has ended, at most; 0 without a limit."""
+        joint = self.settings.joint_from(stage) is not None
+        written = [each for each in self.plan if each.level == stage.level or (joint and each.level > stage.level)]
+        return sum(self.strategy_of(each).most or 0 for each in written)
+
     def density_control(self, stage: Stage, schedule: StageSchedule) -> DensityControl:
         """Return the density control of a stage."""
         control = control_of(self.sharding.strategy(self.strategy_of(stage)), schedule, self.scene.extent)

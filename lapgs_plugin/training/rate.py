@@ -24,15 +24,16 @@ LEAST_STEPS = 3
 def views_per_second(scene: Scene, settings: TrainSettings, placed: PlacedRasterizer) -> float:
     """Return the rate at which a field is rendered, compared with photos and stepped at full size.
 
-    The field has the scene's points, each as often as it takes to reach the strategy's limit of Gaussians. The first
-    step, which compiles, is not measured.
+    The field has the scene's points, each as often as it takes to reach half of the strategy's limit of Gaussians,
+    about as many as a stage has on average, and more of them in one place. The first step, which compiles, is not
+    measured.
     """
     rasterizer, device = in_unit(placed.rasterizer, scene.unit), placed.device
     stage = make_plan(scene.smallest_size, settings)[0]
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     limit = settings.strategy_of(stage, pixels).most or 0
     points = field_from_points(scene.points, scene.colors, settings.sh_degree)
-    rows = torch.arange(max(limit, len(points))) % len(points)
+    rows = torch.arange(max(limit // 2, len(points))) % len(points)
     field = points.with_parameters({name: values[rows] for name, values in points.parameters.items()}).to(device)
     model = TrainableField.create(field, settings.rates, scene.extent, sparse=settings.sparse_adam)
     camera, background = scene.train[0].camera, torch.tensor(scene.background).to(device)

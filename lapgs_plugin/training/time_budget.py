@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.hierarchy.plan import Stage
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 """Seconds of the units of --time."""
@@ -16,6 +17,27 @@ RATE_SHARE = 0.2
 """Share of the seconds since the stage began, the last ones, whose rate is taken for that of the rest."""
 TOLERANCE = 0.01
 """Relative change of the planned length from which on the plan changes."""
+COARSER_COST = 0.35
+"""Time that a view takes to train on, by that of one of twice the sides with the Gaussians of its level: 0.27 to 0.42
+on four scenes (H200). So a level's share of the seconds is not that of the iterations, which `--split` is about."""
+GAUSSIAN_BYTES = 248
+"""Of a Gaussian in a PLY of SH degree 3."""
+WRITTEN_BYTES = 2e8
+"""Bytes of PLY files that are archived a second; 1.7e8 seen where they were put together property by property."""
+
+
+def cost_of(stages: Iterable[Stage]) -> float:
+    """Return the time that stages take together, in that of an iteration at full size.
+
+    >>> round(cost_of([Stage(1, (400, 267), 3000), Stage(0, (800, 533), 1000, signed=True)]))
+    2050
+    """
+    return sum(stage.iterations * COARSER_COST**stage.level for stage in stages)
+
+
+def seconds_to_archive(gaussians: int) -> float:
+    """Estimate how long it takes to write so many Gaussians."""
+    return gaussians * GAUSSIAN_BYTES / WRITTEN_BYTES
 
 
 def parse_duration(text: str) -> float:
@@ -56,22 +78,29 @@ class StageBudget:
 
     Attributes:
         clock: returns seconds.
-        ends: when the stage should end, by the clock, with its last measurement.
-        run_ends: when the run should.
+        run_ends: when the run should end, by the clock.
         planned: iterations of the stage.
+        share: of the seconds that are left when the stage starts, that it has.
+        reserve: seconds that are kept for what follows the iterations of this stage and of finer ones.
         afterwards: views to render after the last iteration, each in about the time of an iteration.
+        ends: when the stage should end, with its last measurement; `start` decides it if it is not given.
     """
 
     clock: Callable[[], float]
-    ends: float
     run_ends: float
     planned: int
+    share: float = 1.0
+    reserve: float = 0.0
     afterwards: int = 0
+    ends: float = math.nan
     _marks: list[tuple[float, int]] = field(default_factory=list, init=False)  # seconds and iterations at each look
 
     def start(self, done: int) -> None:
         """Start to measure the rate, before the first iteration or after `done` ones of a continued stage."""
-        self._marks = [(self.clock(), done)]
+        now = self.clock()
+        if math.isnan(self.ends):  # photos are read by now, so that no stage alone pays for that
+            self.ends = now + self.share * max(0.0, self.run_ends - self.reserve - now)
+        self._marks = [(now, done)]
 
     def length(self, iteration: int) -> int:
         """Return the stage's length in iterations, as planned after one of them."""

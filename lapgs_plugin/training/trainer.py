@@ -47,7 +47,13 @@ from lapgs_plugin.training.stage_start import (
     predict_views,
     stage_geometry,
 )
-from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
+from lapgs_plugin.training.time_budget import (
+    StageBudget,
+    cost_of,
+    parse_duration,
+    require_time_left,
+    seconds_to_archive,
+)
 from lapgs_plugin.training.warm_up import warm_up
 
 
@@ -131,15 +137,15 @@ class Trainer:
         """Return what decides the length of a stage by the clock; None without --time."""
         if (run_ends := self._ends) is None:
             return None
-        now, saved = self.clock(), None if checkpoint is None else checkpoint["budget"]
-        if saved is not None and self.prepared.began is None:
-            ends = now + saved["stage_seconds"]
-        else:
-            done = 0 if checkpoint is None else checkpoint["counts"]["iteration"]
-            left = [each.iterations for each in self.prepared.plan if each.level < stage.level]
-            own = max(1, stage.iterations - done)
-            ends = now + (run_ends - now) * own / (own + sum(left))
-        return StageBudget(self.clock, ends, run_ends, stage.iterations, len(self.prepared.scene.test))
+        prepared, saved = self.prepared, None if checkpoint is None else checkpoint["budget"]
+        budget = StageBudget(self.clock, run_ends, stage.iterations, afterwards=len(prepared.scene.test))
+        if saved is not None and prepared.began is None:
+            return replace(budget, ends=self.clock() + saved["stage_seconds"])
+        done = 0 if checkpoint is None else checkpoint["counts"]["iteration"]
+        own = replace(stage, iterations=max(1, stage.iterations - done))
+        finer = [each for each in prepared.plan if each.level < stage.level]
+        written = sum(map(prepared.gaussians_to_archive, (stage, *finer)))
+        return replace(budget, share=cost_of([own]) / cost_of([own, *finer]), reserve=seconds_to_archive(written))
 
     def _gains(self, stage: Stage, checkpoint: dict[str, Any] | None) -> StageGains | None:
         """Return what decides the length of a stage by views that are set aside; None without --stop auto.

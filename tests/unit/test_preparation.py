@@ -20,6 +20,7 @@ from lapgs_plugin.training.monitor import Monitor
 from lapgs_plugin.training.preparation import TrainRequest, prepare
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
 from lapgs_plugin.training.settings import Densification, TrainingControl, TrainSettings
+from lapgs_plugin.training.time_budget import COARSER_COST
 from lapgs_plugin.training.trainer import Trainer
 from tests.training_runs import StopAt, plys
 
@@ -134,13 +135,14 @@ def test_the_machine_decides_how_many_iterations_a_time_has(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And with them the strategy, unless the user chose it."""
+    cost = 0.5 * COARSER_COST + 0.5  # of an iteration, by that of one at full size
     for rate, chosen, strategy in ((100.0, {"time"}, "mcmc"), (5.0, {"time"}, "3dgs"), (5.0, {"strategy"}, "mcmc")):
         monkeypatch.setattr(preparation, "views_per_second", lambda *_, rate=rate: rate)
         settings = TrainSettings(time="10m", densification=Densification(strategy="mcmc"))
         said: list[str] = []
         out = tmp_path / f"{rate}-{strategy}"
         with prepare(TrainRequest(folder, out, settings, chosen=frozenset(chosen)), said.append) as run:
-            assert run.plan.iterations == run.settings.iterations == pytest.approx(600 * rate, rel=0.1)
+            assert run.plan.iterations == run.settings.iterations == pytest.approx(600 * rate / cost, rel=0.1)
             assert run.settings.densification.strategy == strategy
             assert run.archive.manifest.settings["time"] == "10m"
         assert any("--time 10m: " in line and f"{rate:.3g} views a second" in line for line in said)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import pytest
@@ -11,7 +10,14 @@ from hypothesis import strategies as st
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.hierarchy.plan import StagePlan
-from lapgs_plugin.training.time_budget import StageBudget, parse_duration, require_time_left
+from lapgs_plugin.training.time_budget import (
+    COARSER_COST,
+    StageBudget,
+    cost_of,
+    parse_duration,
+    require_time_left,
+    seconds_to_archive,
+)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +82,7 @@ def test_a_stage_ends_in_time_however_it_was_planned(
     cost: Callable[[int], float], seconds: float, planned: int, afterwards: int
 ) -> None:
     clock = Clock(7.0)
-    budget = StageBudget(clock, 7.0 + seconds, math.inf, planned, afterwards)
+    budget = StageBudget(clock, 7.0 + seconds, planned, afterwards=afterwards)
     assert trained(budget, clock, cost) == budget.planned
     clock.seconds += afterwards * min(cost(budget.planned), cost(budget.planned + 1))
     assert clock.seconds - 7.0 == pytest.approx(seconds, rel=0.03)  # the worst was 2.3 %
@@ -87,7 +93,7 @@ def test_a_stage_ends_in_time_however_it_was_planned(
 def test_at_an_even_rate_the_first_plan_holds(cost: float, seconds: float) -> None:
     """So the progress, from which rates follow, is the share of the seconds that are over."""
     clock = Clock(0.0)
-    budget, plans = StageBudget(clock, seconds, seconds, 10**6), set()
+    budget, plans = StageBudget(clock, seconds, 10**6), set()
     budget.start(0)
     done = 0
     while done < budget.planned:
@@ -103,7 +109,7 @@ def test_at_an_even_rate_the_first_plan_holds(cost: float, seconds: float) -> No
 
 def test_a_continued_stage_has_the_seconds_that_are_left() -> None:
     clock = Clock(100.0)
-    budget = StageBudget(clock, 140.0, 170.0, 5000)
+    budget = StageBudget(clock, 170.0, 5000, ends=140.0)
     budget.start(0)
     for done in range(1, 1001):
         clock.seconds += 0.01
@@ -111,8 +117,30 @@ def test_a_continued_stage_has_the_seconds_that_are_left() -> None:
     state = budget.state()
     assert state == {"planned": 4000, "stage_seconds": pytest.approx(30.0), "run_seconds": pytest.approx(60.0)}
     later = Clock(5000.0)
-    again = StageBudget(later, 5000.0 + state["stage_seconds"], 5000.0 + state["run_seconds"], int(state["planned"]))
+    seconds = state["run_seconds"], state["stage_seconds"]
+    again = StageBudget(later, 5000.0 + seconds[0], int(state["planned"]), ends=5000.0 + seconds[1])
     assert trained(again, later, lambda i: 0.01, done=1000) == pytest.approx(4000, rel=0.01)
+
+
+def test_levels_share_the_seconds_so_that_they_share_the_iterations() -> None:
+    """Whose images of half the size take less time, and what is read and written beside them does not count."""
+    clock, plan = Clock(0.0), StagePlan.create((512, 512), 10_000, 3)
+    trained_on = []
+    for index, stage in enumerate(plan):
+        clock.seconds += 2.0  # photos are read
+        share = cost_of([stage]) / cost_of(list(plan)[index:])
+        reserve = seconds_to_archive(1_000_000 * (3 - index))
+        budget = StageBudget(clock, 100.0, stage.iterations, share, reserve)
+        trained_on.append(trained(budget, clock, lambda i, level=stage.level: 0.01 * COARSER_COST**level))  # type: ignore[misc]
+        clock.seconds += seconds_to_archive(1_000_000)
+    assert clock.seconds == pytest.approx(100.0, rel=0.01)
+    shares = [count / sum(trained_on) for count in trained_on]
+    assert shares == pytest.approx([stage.iterations / plan.iterations for stage in plan], abs=0.02)
+
+
+def test_a_stage_without_time_ends_after_its_first_step() -> None:
+    clock = Clock(0.0)
+    assert trained(StageBudget(clock, 10.0, 1000, reserve=11.0), clock, lambda i: 0.01) == 1
 
 
 @given(st.integers(1, 4), st.integers(1, 50_000), st.data())
