@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
+from curves import at_time, points_of
+
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs/data"
 DOCUMENTS = (ROOT / "docs/results.md", ROOT / "docs/notes/2026-11-results.md")
@@ -31,7 +33,7 @@ QUALITY = {
 }
 OURS = "--rasterizer lapgs"
 """Option of runs of checkouts with our rasterizer; their own scripts beside them have their own."""
-COST = {"busy (s)": ("busy_seconds", "{:.1f}"), "peak GB": ("peak_gb", "{:.2f}")}
+COST = {"peak GB": ("peak_gb", "{:.2f}")}
 
 
 def rewritten(text: str) -> str:
@@ -100,6 +102,30 @@ def train() -> str:
     return compared("train", "one field", scene_title, ("scene",), with_fit=True)
 
 
+def equal_time() -> str:
+    """Return the longest runs of both hierarchies against one field: after the same seconds, and at its best."""
+    same, best = "after the same seconds: ", "against its best: "
+    figures = ["PSNR", "after fit", "SSIM", "LPIPS"]
+    header = ["", "method", "seconds", same + figures[0], *figures[1:], best + "time", "after fit", "LPIPS"]
+    rows = []
+    runs = runs_of("curves")
+    for scene in dict.fromkeys(run["scene"] for run in runs):
+        here = [run for run in runs if run["scene"] == scene]
+        field = points_of(here, "one field")
+        most = max(field, key=lambda point: point["psnr_fit"])
+        first = scene_title(here[0])
+        for method in ("nested", "laplacian"):
+            point = points_of(here, method)[-1]
+            then = at_time(field, point["seconds"])
+            gains = [f"{point[name] - then[name]:+.2f}" for name in ("psnr", "psnr_fit")]
+            gains += [f"{point['ssim'] - then['ssim']:+.3f}", f"{point['lpips'] / then['lpips'] - 1:+.1%}"]
+            whole = [f"{point['seconds'] / most['seconds']:.2f}", f"{point['psnr_fit'] - most['psnr_fit']:+.2f}"]
+            whole.append(f"{point['lpips'] / most['lpips'] - 1:+.1%}")
+            rows.append([first, method, f"{point['seconds']:.1f}", *gains, *whole])
+            first = ""
+    return markdown(header, rows)
+
+
 def ours() -> str:
     """Return checkouts that our rasterizer renders beside their own scripts, one a row."""
     columns = {"PSNR": ("psnr", "{:.2f} dB"), "peak": ("peak_gb", "{:.2f} GB")}
@@ -142,6 +168,7 @@ def cpu() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "train": train,
+    "equal-time": equal_time,
     "ours": ours,
     "fastgs": lambda: checkouts(fastgs=True),
     "forks": lambda: checkouts(fastgs=False),
