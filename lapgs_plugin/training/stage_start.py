@@ -24,7 +24,7 @@ from lapgs_plugin.runs.run_files import Falloffs
 from lapgs_plugin.runs.upsampled_images import UpsampledImages
 from lapgs_plugin.scenes.exposure import SparseColors, colors_at, measure_exposure, sparse_colors
 from lapgs_plugin.scenes.parallel import MOST_READERS, ahead, readers_of
-from lapgs_plugin.scenes.scene import View, with_pixels
+from lapgs_plugin.scenes.scene import View
 from lapgs_plugin.scenes.vignetting import measure_vignetting
 from lapgs_plugin.stages.appearance import DIFFERENT, KINDS, ViewAppearance, ViewColors, from_gains, identities
 from lapgs_plugin.stages.geometry import StageGeometry, at_level, depths_of, skies_of
@@ -100,7 +100,8 @@ def photos_of(run: PreparedRun, stage: Stage) -> StageImages:
 
 
 def _are_eight_bit(views: Sequence[View]) -> bool:
-    return all(eight_bit_levels(view.image) is not None for view in with_pixels(views))
+    readers = readers_of(view.camera.size for view in views)
+    return all(ahead(lambda view: eight_bit_levels(view.image) is not None, views, most=readers))
 
 
 def predict_views(run: PreparedRun, stage: Stage, images: StageImages, overhead: Overhead) -> None:
