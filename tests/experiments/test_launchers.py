@@ -19,7 +19,7 @@ from lapgs_bench.experiments.settings import WorkerSettings
 from lapgs_bench.experiments.store import DONE, Outcome, ResultStore
 from lapgs_bench.experiments.worker import Slot, gpu_name
 from lapgs_plugin.errors import UserInputError
-from tests.experiments.examples import COPY, START, copying_jobs, starts
+from tests.experiments.examples import COPY, RAY_WARNS, START, copying_jobs, starts
 
 NOTE_ENVIRONMENT = START + (
     "import os; stream = open(started + '-gpus', 'a'); "
@@ -114,8 +114,8 @@ def test_an_option_that_submitit_does_not_know(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@RAY_WARNS
 def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -> None:
-    """Needs Ray: pip install 'lapgs_plugin[ray]'."""
     ray = pytest.importorskip("ray")
     killing = "import os; open(started + '-worker', 'w').write(str(os.getppid())); "
     code, options = COPY.replace(START, START + killing), ["num_cpus=1"]

@@ -17,6 +17,7 @@ from lapgs_plugin.files import MANIFEST
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT, HISTORY, JOBS, PLY, TILE_LOG, remove_results
 from lapgs_plugin.scenes.sample import make_sample_scene
+from tests.experiments.examples import RAY_WARNS
 from tests.waiting import wait_for
 
 OPTIONS = ("--iterations", "40", "--sh-degree", "1", "--hierarchy", "nested", "--eval", "--tiles", "1x2")
@@ -80,7 +81,9 @@ def fields_of(run: Path) -> list[bytes]:
     [
         (None, "--launcher local --workers 5"),
         ("submitit", "--launcher slurm --workers 2 --launcher-option cluster=local"),
-        pytest.param("ray", "--launcher ray --workers 2 --launcher-option num_cpus=0.5", marks=pytest.mark.slow),
+        pytest.param(
+            "ray", "--launcher ray --workers 2 --launcher-option num_cpus=0.5", marks=(pytest.mark.slow, RAY_WARNS)
+        ),
     ],
 )
 def test_tiles_of_every_launcher_have_the_bits_of_one_after_the_other(
