@@ -94,7 +94,7 @@ def tiles(
 
     Examples:
 
-        lapgs bench tiles runs/town --launcher slurm --workers 6 --launcher-option slurm_partition=gpu
+        lapgs bench tiles runs/town --launcher slurm --workers 6
 
         lapgs bench tiles runs/town --launcher ray --launcher-option address=auto
     """

@@ -13,17 +13,21 @@ from lapgs_bench.experiments.settings import WorkerSettings
 from lapgs_bench.experiments.store import FAILED, Job, Outcome
 from lapgs_plugin.cli.train import show_finished
 from lapgs_plugin.errors import counted
+from lapgs_plugin.hierarchy.settings import AUTO
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import JOBS, TILE_LOG
 from lapgs_plugin.tiles.run import merge_tiles, unfinished_tiles
 from lapgs_plugin.tiles.tile import Tile
 from lapgs_plugin.tiles.workers import TileFailedError
+from lapgs_plugin.training.backend import choose_rasterizer
 from lapgs_plugin.training.settings import TrainingControl
 
 
 def train_tiles(run: Path, moved_to: Path | None, engine: WorkerSettings, control: TrainingControl) -> None:
     """Run what the help of `lapgs bench tiles` says."""
     check_launcher(engine)
+    if control.rasterizer != AUTO:  # which each worker chooses for its machine
+        choose_rasterizer(control.rasterizer)
     run = run.absolute()  # workers may have other current folders
     tiles = unfinished_tiles(run, moved_to)
     if tiles:

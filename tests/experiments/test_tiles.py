@@ -113,8 +113,8 @@ def test_a_failed_tile_is_named_and_continued(run: Path, trained: Path, lapgs: L
     assert last.endswith("; the others are kept; once the cause is mended, the same command continues")
     assert not RunArchive.open(run).manifest.complete
     stranger.unlink()
-    assert "tile 0,0" not in lapgs("bench", "tiles", run, "--rasterizer", "cpu")
-    assert "--rasterizer cpu" in (run / "tile_0_1" / TILE_LOG).read_text()
+    assert "tile 0,0" not in lapgs("bench", "tiles", run, "--rasterizer", "cpu", "--breakdown")
+    assert "--rasterizer cpu --breakdown --resume" in (run / "tile_0_1" / TILE_LOG).read_text()
     assert fields_of(run) == fields_of(trained)
     remove_results(run)
     assert not (run / JOBS).exists()
@@ -151,6 +151,7 @@ def test_bad_requests_are_one_line(run: Path, trained: Path, scene: Path, tmp_pa
 
     assert "--launcher pbs: expected local, slurm, ray" in refused(run, "--launcher", "pbs")
     assert "--launcher-option x: the local launcher has none" in refused(run, "--launcher-option", "x=1")
+    assert "--rasterizer none: expected auto, " in refused(run, "--rasterizer", "none")
     assert "--launcher-option gpus: expected NAME=VALUE" in refused(run, "--launcher-option", "gpus")
     assert "expected a folder written by `lapgs train -o`" in refused(tmp_path / "none")
     assert f"--scene: {tmp_path / 'gone'}" in refused(run, "--scene", tmp_path / "gone")
