@@ -8,10 +8,11 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lapgs_bench.experiments.settings import BenchSettings
+from lapgs_bench.experiments.settings import BenchSettings, WorkerSettings
 from lapgs_bench.kernels.commands import blend, ops, raster
 from lapgs_bench.pareto.settings import ParetoSettings
 from lapgs_plugin.cli.bridge import takes_settings
+from lapgs_plugin.training.settings import TrainingControl
 
 EXPERIMENT = "run"
 """The default subcommand: `lapgs bench smoke`."""
@@ -73,6 +74,35 @@ def pareto(
     draw_pareto(scene, settings)
 
 
+@takes_settings
+def tiles(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="Run of `lapgs train --tiles` whose coarser levels are finished, as by --only-base."
+        ),
+    ],
+    scene: Annotated[Path | None, typer.Option(help="Scene folder, if it was moved after training.")] = None,
+    *,
+    engine: WorkerSettings,
+    control: TrainingControl,
+) -> None:
+    """Train the tiles of RUN on this machine, Slurm or Ray, and merge them.
+
+    Each worker takes the next tile that is not finished. Repeat the command to continue after Ctrl-C or a crash, with
+    any launcher; each tile goes on from its last checkpoint.
+
+    Examples:
+
+        lapgs bench tiles runs/town --launcher slurm --workers 6
+
+        lapgs bench tiles runs/town --launcher ray --launcher-option address=auto
+    """
+    from lapgs_bench.tiles import train_tiles
+
+    train_tiles(run, scene, engine, control)
+
+
 app = typer.Typer(
     name="bench",
     cls=_ExperimentByDefault,
@@ -85,3 +115,4 @@ app.command("raster")(raster)
 app.command("ops")(ops)
 app.command("blend")(blend)
 app.command("pareto")(pareto)
+app.command("tiles")(tiles)

@@ -6,15 +6,21 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
 
 from lapgs_bench.experiments.commands import Locations, defaults_of, run_steps
 from lapgs_bench.experiments.expansion import PlannedRun, SceneSpec
-from lapgs_bench.experiments.launchers import Launcher
+from lapgs_bench.experiments.launchers import Launcher, WorkOrder, launch
 from lapgs_bench.experiments.mistakes import Mistakes
 from lapgs_bench.experiments.schema import SampleScene
-from lapgs_bench.experiments.store import LOCK_TIMEOUT, Job, Outcome, ResultStore
-from lapgs_plugin.errors import UserInputError
+from lapgs_bench.experiments.settings import WorkerSettings
+from lapgs_bench.experiments.store import DONE, FAILED, LOCK_TIMEOUT, Job, Outcome, ResultStore
+from lapgs_plugin.cli.output import make_console
+from lapgs_plugin.errors import TrainingStoppedError, UserInputError
 from lapgs_plugin.files import FolderLock, one_line_errors
+from lapgs_plugin.progress import item_progress
 from lapgs_plugin.scenes.resolution import parse_size
 
 logger = logging.getLogger(__name__)
@@ -104,6 +110,55 @@ def make_samples(scenes: Sequence[SceneSpec], folder: Path) -> None:
 
 def _sample_folder(name: str, sample: SampleScene, folder: Path) -> Path:
     return folder.absolute() / SCENES / f"{name}-{sample.label}"
+
+
+def follow(
+    jobs: Sequence[Job],
+    folder: Path,
+    engine: WorkerSettings,
+    unit: str,
+    summary: Callable[[dict[str, Any]], str],
+    repeat: bool = False,
+) -> list[Outcome]:
+    """Run jobs on workers, with a progress bar and a line for each that ends.
+
+    Args:
+        jobs: to run, unless the store has finished them.
+        folder: gets the store, and what workers say.
+        engine: starts the workers.
+        unit: plural of what a job makes, such as "runs".
+        summary: describes a finished job by its record.
+        repeat: run those again that the store has finished.
+
+    Returns:
+        All jobs, each done or failed.
+
+    Raises:
+        TrainingStoppedError: a signal stopped this command.
+        UserInputError: as `execute`.
+    """
+    store = ResultStore.create(folder / STORE)
+    store.plan(jobs, repeat)
+    run_ids = [job.run_id for job in jobs]
+    order = WorkOrder(folder.absolute() / STORE, run_ids, folder.absolute() / LOGS / "workers", engine)
+    finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
+    if finished:
+        make_console(stderr=True).print(f"{finished} of {len(run_ids)} {unit} are done already")
+    with item_progress(unit) as progress:
+        task = progress.add_task("Running", total=len(run_ids), completed=finished)
+
+        def show(outcome: Outcome) -> None:
+            progress.advance(task)
+            if outcome.state == FAILED:
+                text = f"[red]failed[/red] {outcome.run_id}\n{escape(outcome.error)}"
+            else:
+                text = f"[green]done[/green]   {outcome.run_id}: {summary(outcome.record or {})}"
+            progress.console.print(text, soft_wrap=True, highlight=False)
+
+        try:
+            return execute(store, run_ids, lambda: launch(order), show)
+        except KeyboardInterrupt:
+            raise TrainingStoppedError(f"stopped; repeat the command to continue with the remaining {unit}") from None
 
 
 def execute(

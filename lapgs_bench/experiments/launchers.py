@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import signal
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -184,7 +185,9 @@ class RayLauncher(Launcher):
         self._ray = ray
         self._started = not ray.is_initialized()
         if self._started:
+            handler = signal.getsignal(signal.SIGTERM)
             ray.init(address=options.get("address"), log_to_driver=False, include_dashboard=False)
+            signal.signal(signal.SIGTERM, handler)  # Ray's would end this process before workers are stopped
         resources = ray.cluster_resources()
         gpus = float(options.get("num_gpus", 1 if resources.get("GPU") else 0))
         cpus = float(options.get("num_cpus", 1))

@@ -8,18 +8,32 @@ runs are timed. CORES are processor numbers separated by commas, or - for all.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from functools import partial
+
+PR_SET_PDEATHSIG = 1
+"""Linux's prctl(2) that ends the command with this process, which Ray kills together with a worker."""
 
 
 def main() -> int:
     cores, command = sys.argv[1], sys.argv[2:]
-    if cores != "-" and sys.platform == "linux":
-        os.sched_setaffinity(0, [int(core) for core in cores.split(",")])
-    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+    first: Callable[[], object] | None = None
+    if sys.platform == "linux":
+        first = partial(ctypes.CDLL(None).prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
+        if cores != "-":
+            os.sched_setaffinity(0, [int(core) for core in cores.split(",")])
+    child = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=first,  # noqa: PLW1509  # safe, because there is no other thread yet
+    )
     threading.Thread(target=_kill_when_released, args=(child,), daemon=True).start()
     code = child.wait()
     return code if code >= 0 else 128 - code

@@ -50,6 +50,7 @@ def result_row(job: Job) -> dict[str, Any]:
     Raises:
         RunFolderError: the run's folder lacks files that its commands should have written.
     """
+    assert job.spec is not None, "a job without results has no row of them"
     folder = measured_folder(job.spec, Path(job.folder))
     row = {**_identity(job.spec, job.run_id), "measured_by": EVALUATED if job.evaluate else RECORDED}
     if not job.evaluate and folder != Path(job.folder):

@@ -14,15 +14,15 @@ from lapgs_bench.experiments import exports
 from lapgs_bench.experiments.aggregate import baseline_of, check_table, make_table
 from lapgs_bench.experiments.checks import check_runs
 from lapgs_bench.experiments.commands import Locations
-from lapgs_bench.experiments.execution import LOGS, STORE, execute, make_samples, prepare
+from lapgs_bench.experiments.execution import LOGS, STORE, follow, make_samples, prepare
 from lapgs_bench.experiments.expansion import PlannedRun, plan_runs, scenes_of
 from lapgs_bench.experiments.figures.write import FOLDER, write_figures
-from lapgs_bench.experiments.launchers import WorkOrder, check_launcher, launch
+from lapgs_bench.experiments.launchers import check_launcher
 from lapgs_bench.experiments.mistakes import Mistakes
 from lapgs_bench.experiments.schema import Experiment, load_experiment
-from lapgs_bench.experiments.settings import BenchSettings, WorkerSettings
+from lapgs_bench.experiments.settings import BenchSettings
 from lapgs_bench.experiments.standard import experiment_file
-from lapgs_bench.experiments.store import DONE, FAILED, Job, Outcome, ResultStore
+from lapgs_bench.experiments.store import FAILED, ResultStore
 from lapgs_bench.experiments.tables import latex, markdown
 from lapgs_plugin import __version__
 from lapgs_plugin.cli.output import make_console, say
@@ -32,12 +32,10 @@ from lapgs_plugin.errors import (
     LapgsError,
     MissingExtraError,
     RunFolderError,
-    TrainingStoppedError,
     UserInputError,
     printable_lines,
 )
 from lapgs_plugin.files import is_file, is_folder, write_text
-from lapgs_plugin.progress import item_progress
 from lapgs_plugin.runs.layout import require_place, require_utf8
 
 SET_BY_EXPERIMENTS = {
@@ -83,7 +81,7 @@ def run_experiment(file: Path, settings: BenchSettings) -> None:
             say("\n".join([f"# {job.run_id}", *commands]))
         return
     make_samples(scenes, folder)
-    _follow(jobs, folder, settings.engine)
+    follow(jobs, folder, settings.engine, "runs", _summary)
     _write(experiment, planned, folder)
 
 
@@ -104,32 +102,6 @@ def _measuring(settings: BenchSettings) -> list[str] | None:
         if not is_file(file):
             raise UserInputError(f"--lpips-weights {file}: no such file; expected the weights of an LPIPS network")
     return [word for file in weights for word in ("--lpips-weights", str(file.absolute()))]
-
-
-def _follow(jobs: Sequence[Job], folder: Path, engine: WorkerSettings) -> None:
-    """Run the jobs with a progress bar and a line for each finished run."""
-    store = ResultStore.create(folder / STORE)
-    store.plan(jobs)
-    run_ids = [job.run_id for job in jobs]
-    order = WorkOrder(folder.absolute() / STORE, run_ids, folder.absolute() / LOGS / "workers", engine)
-    finished = sum(outcome.state == DONE for outcome in store.outcomes(run_ids))
-    if finished:
-        make_console(stderr=True).print(f"{finished} of {len(run_ids)} runs are done already")
-    with item_progress("runs") as progress:
-        task = progress.add_task("Running", total=len(run_ids), completed=finished)
-
-        def show(outcome: Outcome) -> None:
-            progress.advance(task)
-            if outcome.state == FAILED:
-                text = f"[red]failed[/red] {outcome.run_id}\n{escape(outcome.error)}"
-            else:
-                text = f"[green]done[/green]   {outcome.run_id}: {_summary(outcome.record or {})}"
-            progress.console.print(text, soft_wrap=True, highlight=False)
-
-        try:
-            execute(store, run_ids, lambda: launch(order), show)
-        except KeyboardInterrupt:
-            raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
 
 
 def _summary(record: dict[str, Any]) -> str:

@@ -63,6 +63,7 @@ class Job:
     """Describe a run to a worker: its settings, output folder, log file and commands.
 
     Attributes:
+        spec: settings in its row of results; None without such a row.
         evaluate: whether the last command is `lapgs eval`.
         defaults: see `commands.defaults_of`.
     """
@@ -70,16 +71,24 @@ class Job:
     __pydantic_config__: ClassVar[Any] = STRICT
 
     run_id: str
-    spec: RunSpec
+    spec: RunSpec | None
     folder: str
     log: str
     steps: tuple[Step, ...]
     evaluate: bool
     defaults: str
 
+    @property
+    def continues(self) -> bool:
+        """Whether its commands continue what is in its folder, as a tile's do; others start in an empty one."""
+        return self.spec is None
+
     def attempt(self, number: int) -> Job:
-        """Return the job in a separate folder: a worker that lost its claim may still write to the previous one."""
-        if number == 1:
+        """Return the job in a separate folder: a worker that lost its claim may still write to the previous one.
+
+        A job that continues keeps its folder, which `lapgs train` locks.
+        """
+        if number == 1 or self.continues:
             return self
         folder, log = f"{self.folder}-attempt{number}", f"{self.log.removesuffix('.log')}-attempt{number}.log"
         steps = [
@@ -161,14 +170,20 @@ class ResultStore:
                 connection.executemany("INSERT OR IGNORE INTO about VALUES (?, ?)", values)
         return cls(path)
 
-    def plan(self, jobs: Sequence[Job]) -> None:
+    def plan(self, jobs: Sequence[Job], repeat: bool = False) -> None:
         """Add runs in this order. Finished runs stay; failed runs become pending again.
+
+        Args:
+            jobs: the runs.
+            repeat: make finished runs pending again, too.
 
         Raises:
             RunFolderError: the other runs would have other defaults than those that are finished or running.
         """
         with _transaction(self._path) as connection:
             self._require_same_defaults(connection, jobs)
+            again = (PENDING, FAILED, DONE) if repeat else (PENDING, FAILED)
+            states = ", ".join("?" * len(again))
             for position, job in enumerate(jobs):
                 connection.execute(
                     "INSERT INTO runs (run_id, position, job, state) VALUES (?, ?, ?, ?) "
@@ -176,8 +191,9 @@ class ResultStore:
                     (job.run_id, position, job.to_json(), PENDING),
                 )
                 connection.execute(
-                    "UPDATE runs SET job = ?, state = ?, claims = 0, error = NULL WHERE run_id = ? AND state IN (?, ?)",
-                    (job.to_json(), PENDING, job.run_id, PENDING, FAILED),
+                    "UPDATE runs SET job = ?, state = ?, claims = 0, record = NULL, error = NULL "
+                    f"WHERE run_id = ? AND state IN ({states})",
+                    (job.to_json(), PENDING, job.run_id, *again),
                 )
 
     def _require_same_defaults(self, connection: sqlite3.Connection, jobs: Sequence[Job]) -> None:

@@ -72,7 +72,7 @@ class RunFailedError(LapgsError):
 
 
 def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) -> dict[str, Any]:
-    """Train and evaluate one run, and return its row of results."""
+    """Run the commands of one run, and return its row of results."""
     from lapgs_bench.experiments.rows import result_row
 
     job = claim.job
@@ -80,19 +80,19 @@ def _run(store: ResultStore, claim: Claim, slot: Slot, stop: threading.Event) ->
     log = Path(job.log)
     require_own(folder)
     require_own(log)
-    if folder.exists():  # left by an earlier command
+    if folder.exists() and not job.continues:  # left by an earlier command
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     log.parent.mkdir(parents=True, exist_ok=True)
     started, clock = datetime.now(timezone.utc).isoformat(timespec="seconds"), time.perf_counter()
-    with log.open("wb") as stream:
+    with log.open("ab" if job.continues else "wb") as stream:
         for step in job.steps:
             if code := _execute(step, stream, store, claim, slot, stop):
                 stream.flush()
                 raise RunFailedError(f"exit code {code}; {log} ends with", *last_lines(log))
     installed = versions()
     return {
-        **result_row(job),
+        **({} if job.continues else result_row(job)),
         "wall_seconds": time.perf_counter() - clock,
         "lapgs_version": __version__,
         "torch": installed["torch"],

@@ -210,9 +210,7 @@ def train(
     request.ranks.close()
     if not leads:
         return
-    if request.settings.time is None:  # a preview is beyond the time
-        _save_preview(out, scene)
-    _say_what_is_next(out)
+    show_finished(out, scene, preview=request.settings.time is None)  # a preview is beyond the time
 
 
 def _write_options(path: Path, run: PreparedRun, context: typer.Context) -> str | None:
@@ -273,8 +271,7 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, start: Star
     if workers is not None:
         tell("the coarser levels are trained by one process; then the tiles at the same time")
     if train_tiles(request, shape, started, tell, queue=queue, workers=workers):
-        _save_preview(out, scene)
-        _say_what_is_next(out)
+        show_finished(out, scene)
     return True
 
 
@@ -294,17 +291,20 @@ def _train(run: PreparedRun, watcher: Watcher, finest: int = 0) -> None:
         Trainer(run, monitor=monitor, watcher=watcher, finest=finest).run()
 
 
-def _save_preview(out: Path, scene: Path) -> None:
-    """Save the picture of a finished run that the viewer shows first."""
-    from lapgs_plugin.viewer.preview import save_run_preview
+def show_finished(out: Path, scene: Path, preview: bool = True) -> None:
+    """Say what can be done with a finished run.
 
-    save_run_preview(out, moved_to=scene)
-
-
-def _say_what_is_next(out: Path) -> None:
-    """Say what can be done with a finished run."""
+    Args:
+        out: the run.
+        scene: its scene, now.
+        preview: save the picture that the viewer shows first.
+    """
     from rich.markup import escape
 
+    from lapgs_plugin.viewer.preview import save_run_preview
+
+    if preview:
+        save_run_preview(out, moved_to=scene)
     name, word = (escape(printable(text)) for text in (str(out), shlex.quote(str(out))))
     make_console(stderr=True).print(
         f"[bold]{name}[/bold] holds the run; next: `lapgs eval {word}`, `lapgs render {word}` or `lapgs view {word}`",

@@ -13,6 +13,7 @@
     RUN/run.toml                   the options of `lapgs train` that made the run
     RUN/tiles.json                 how the scene is divided, of a run with --tiles and of each of its tiles
     RUN/tile_<r>_<c>/              run of the tile in row r and column c
+    RUN/jobs/                      which tiles workers of `lapgs bench tiles` have, and what the workers say
     RUN/tensorboard/               its event files, with --log tensorboard
     RUN/preview.jpg                an image that the viewer shows until it can render
     RUN/metrics.json, RUN/stability.json, RUN/renders/, RUN/export/, RUN/report.html   results of other commands
@@ -54,7 +55,7 @@ HISTORY, METRICS, CHECKPOINT = "history.jsonl", "metrics.json", "checkpoint.pt"
 RENDERS, REPORT, STABILITY, EXPORT, CACHE = "renders", "report.html", "stability.json", "export", "cache"
 RUN_CONFIG, TENSORBOARD = "run.toml", "tensorboard"
 CAMERAS, VIGNETTING = "view_cameras.json", "vignetting.json"
-TILES, TILE, TILE_LOG = "tiles.json", "tile_{}_{}", "train.log"
+TILES, TILE, TILE_LOG, JOBS = "tiles.json", "tile_{}_{}", "train.log", "jobs"
 # Files of a level. Checkouts write theirs beside them, among these an exposure.json of another meaning.
 PLY, OPTIMIZER, EXPOSURE, POSES = "point_cloud.ply", "optimizer.pt", "view_colors.json", "view_poses.json"
 GRIDS = "view_grids.pt"
@@ -159,7 +160,7 @@ def require_own_results(folder: Path) -> None:
     files = (LOCK, MANIFEST, PREVIEW, HISTORY, METRICS, CHECKPOINT, STABILITY, REPORT, RUN_CONFIG, CAMERAS, VIGNETTING)
     with one_line_errors(folder, "read"):
         parts = [path.name for pattern in ("level_*", TILE.format("*", "*")) for path in folder.glob(pattern)]
-    require_own_entries(folder, (*files, TILES, RENDERS, EXPORT, TENSORBOARD, CACHE, *parts))
+    require_own_entries(folder, (*files, TILES, JOBS, RENDERS, EXPORT, TENSORBOARD, CACHE, *parts))
 
 
 def is_run(folder: Path) -> bool:
@@ -197,7 +198,7 @@ def remove_results(folder: Path) -> None:
     remove_scratch(folder)
     for name in (HISTORY, METRICS, STABILITY, REPORT, PREVIEW, RUN_CONFIG, CAMERAS, VIGNETTING, TILES):
         (folder / name).unlink(missing_ok=True)
-    for name in (RENDERS, EXPORT, TENSORBOARD):
+    for name in (RENDERS, EXPORT, TENSORBOARD, JOBS):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
     for level in folder.glob("level_*/"):

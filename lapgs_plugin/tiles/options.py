@@ -43,7 +43,8 @@ class TileOptions:
     only_base: bool = option(
         False,
         "End after the coarser levels of --tiles and print the command of each tile on a line, on stdout, for "
-        "a queue or other machines; --resume trains those that are missing and merges all.",
+        "a queue or other machines; --resume trains those that are missing and merges all. `lapgs bench tiles` does "
+        "both on Slurm or Ray.",
         panel=PANEL,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -88,22 +89,39 @@ def train_tiles(
             queue(tile.command(request.control))
         return False
     if workers is None:
-        unseen = {tile.place for tile in tiles if not train_tile(tile, tile.folder, request.control, train, say)}
+        for tile in tiles:
+            train_tile(tile, tile.folder, request.control, train, say)
     else:
-        train_apart([tile for tile in tiles if not _is_complete(tile)], workers, request.control)
-        unseen = {tile.place for tile in tiles if not is_run(tile.folder)}
-    if len(unseen) == len(tiles):
-        raise UserInputError(
-            f"{out}: fewer than {LEAST_VIEWS} training views see each of its {grid.text} tiles, so that nothing was "
-            "trained beyond the base; start again with --overwrite and fewer tiles"
-        )
-    _merge(out, grid, unseen)
+        train_apart(_unfinished(tiles), workers, request.control)
+    merge_tiles(out)
     return True
 
 
-def _is_complete(tile: Tile) -> bool:
-    """Return whether a tile is trained already."""
-    return is_run(tile.folder) and RunArchive.open(tile.folder).manifest.complete
+def unfinished_tiles(out: Path, moved_to: Path | None = None) -> list[Tile]:
+    """Return the tiles of a run that are still to be trained by their commands, none of a run that is merged.
+
+    Args:
+        out: the run, whose base is finished.
+        moved_to: current folder of the scene; None if it is where the manifest says.
+
+    Raises:
+        RunFolderError: it is not made of tiles or is one of them, its base is not finished, or its scene is missing.
+        UserInputError: it is another scene.
+    """
+    base, grid = RunArchive.open(out), read_grid(out)
+    if grid.only is not None:
+        raise RunFolderError(f"{out} is a tile of another run; give that one")
+    if base.manifest.complete:
+        return []
+    scene = Path(base.manifest.scene.path) if moved_to is None else moved_to.absolute()
+    _require_base(base, scene)
+    run_cameras(base, moved_to)  # is refused here once, instead of by the command of each tile
+    return _unfinished([Tile(out, scene, place) for place in grid])
+
+
+def _unfinished(tiles: Sequence[Tile]) -> list[Tile]:
+    """Return those tiles that are not trained yet."""
+    return [tile for tile in tiles if not (is_run(tile.folder) and RunArchive.open(tile.folder).manifest.complete)]
 
 
 def train_tile(
@@ -271,14 +289,23 @@ def _require_tile_of(base: RunArchive, grid: TileGrid, folder: Path) -> RunArchi
     return tile
 
 
-def _merge(out: Path, grid: TileGrid, unseen: set[tuple[int, int]]) -> None:
-    """Finish a run by the Gaussians that each tile has inside of itself.
+def merge_tiles(out: Path) -> None:
+    """Finish a run by the Gaussians that each tile has inside of itself. Tiles that no view sees keep the base's.
 
     Args:
-        out: the run, whose shared levels are finished.
-        grid: its tiles.
-        unseen: tiles without a run, which keep the shared level.
+        out: the run, whose shared levels are finished. All of its tiles that views see are trained.
+
+    Raises:
+        UserInputError: no tile is seen by enough views.
+        RunFolderError: another process writes to the run, or its tiles are merged already.
     """
+    grid = read_grid(out)
+    unseen = {place for place in grid if not is_run(out / TILE.format(*place))}
+    if len(unseen) == math.prod(grid.shape):
+        raise UserInputError(
+            f"{out}: fewer than {LEAST_VIEWS} training views see each of its {grid.text} tiles, so that nothing was "
+            "trained beyond the base; start again with --overwrite and fewer tiles"
+        )
     with RunArchive.open(out, resume=True) as archive:
         shared = archive.field(SHARED)
         parts, records, colors = [], [], []

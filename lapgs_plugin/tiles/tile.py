@@ -43,8 +43,11 @@ class Tile:
             "--threads": control.threads,
             "--checkpoint-every": control.checkpoint_every,
             "--log": control.log,
+            "--test-every": control.test_every,
         }
-        return words + [word for name, value in chosen.items() if value is not None for word in (name, str(value))]
+        flags = {"--breakdown": control.breakdown, "--gpu-busy": control.gpu_busy}
+        words += [word for name, value in chosen.items() if value is not None for word in (name, str(value))]
+        return words + [name for name, wanted in flags.items() if wanted]
 
     def command(self, control: TrainingControl) -> str:
         """Return the command that trains it alone, for a shell."""

@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from lapgs_bench.experiments import run
+from lapgs_bench.experiments import execution, run
 from lapgs_bench.experiments.run import option_names
 from lapgs_bench.experiments.schema import load_experiment
 from lapgs_bench.experiments.standard import EXPERIMENTS
@@ -78,7 +78,7 @@ def _here(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object) -> None:
         raise AssertionError("something was started or written")
 
-    monkeypatch.setattr(run, "launch", started)
+    monkeypatch.setattr(execution, "launch", started)
     monkeypatch.setattr(run, "make_samples", started)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from lapgs_bench.experiments.commands import Step
@@ -16,6 +17,12 @@ from lapgs_bench.experiments.store import Job
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
+
+RAY_WARNS = pytest.mark.filterwarnings(
+    "ignore:Tip. In future versions of Ray:FutureWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",  # about processes that it leaves to themselves
+)
+"""Mark of a test that starts a cluster of Ray. It needs Ray: pip install 'lapgs_plugin[ray]'."""
 
 SMALL: dict[str, Any] = {
     "name": "small",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +21,8 @@ from lapgs_bench.experiments.settings import WorkerSettings
 from lapgs_bench.experiments.store import DONE, Outcome, ResultStore
 from lapgs_bench.experiments.worker import Slot, gpu_name
 from lapgs_plugin.errors import UserInputError
-from tests.experiments.examples import COPY, START, copying_jobs, starts
+from tests.experiments.examples import COPY, RAY_WARNS, START, copying_jobs, starts
+from tests.waiting import wait_for
 
 NOTE_ENVIRONMENT = START + (
     "import os; stream = open(started + '-gpus', 'a'); "
@@ -113,9 +116,21 @@ def test_an_option_that_submitit_does_not_know(tmp_path: Path) -> None:
         launch(order(tmp_path, 1, 1, launcher="slurm", launcher_option=["cluster=local", "slurm_partiton=gpu"]))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems leave the command alone")
+def test_a_command_ends_with_its_leash() -> None:
+    code = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    command = [sys.executable, "-m", "lapgs_bench.experiments.leash", "-", sys.executable, "-c", code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as leash:
+        assert leash.stdout is not None
+        child = Path("/proc", leash.stdout.readline().decode().strip(), "cmdline")
+        assert child.read_bytes()
+        leash.kill()
+        wait_for(lambda: not child.exists() or not child.read_bytes())  # gone, or not yet waited for by its new parent
+
+
 @pytest.mark.slow
+@RAY_WARNS
 def test_tasks_of_a_local_ray_cluster_whose_workers_are_killed(tmp_path: Path) -> None:
-    """Needs Ray: pip install 'lapgs_plugin[ray]'."""
     ray = pytest.importorskip("ray")
     killing = "import os; open(started + '-worker', 'w').write(str(os.getppid())); "
     code, options = COPY.replace(START, START + killing), ["num_cpus=1"]

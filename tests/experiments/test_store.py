@@ -48,6 +48,16 @@ def planned(tmp_path: Path) -> tuple[ResultStore, list[str]]:
     return store, [job.run_id for job in jobs]
 
 
+def test_a_finished_run_is_repeated_only_if_that_is_asked_for(tmp_path: Path) -> None:
+    jobs = copying_jobs(tmp_path, 2)
+    worked(tmp_path, jobs)
+    store = ResultStore(tmp_path / "results.sqlite")
+    store.plan(jobs)
+    assert [outcome.state for outcome in store.outcomes()] == [DONE, DONE]
+    store.plan(jobs[1:], repeat=True)
+    assert [(outcome.state, outcome.record is None) for outcome in store.outcomes()] == [(DONE, False), (PENDING, True)]
+
+
 def test_workers_share_the_runs(planned: tuple[ResultStore, list[str]], tmp_path: Path) -> None:
     store, run_ids = planned
     workers = [start_worker(tmp_path / "results.sqlite", run_ids) for _ in range(2)]
