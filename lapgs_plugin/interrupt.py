@@ -30,6 +30,11 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SAME_PRESS = 0.5
 """Seconds in which another signal counts as the first: wrappers forward a Ctrl-C that the terminal sent to both."""
 
+PARENT = "LAPGS_PARENT"
+"""Environment variable with the number of the process that starts this one, which then ends with it."""
+POLL = 0.2
+"""Seconds between two looks at the parent."""
+
 _SHOW_CURSOR = "\x1b[?25h"
 """Terminal code that shows the cursor, which progress bars hide."""
 
@@ -77,6 +82,9 @@ def install() -> None:
         atexit.register(signal.signal, number, signal.SIG_IGN)
     sys.unraisablehook = _leave_if_lost
     setattr(ExtensionFileLoader, "exec_module", _keeping_handlers(ExtensionFileLoader.exec_module))  # noqa: B010
+    # Windows has other parents between, and never says that one is gone.
+    if (parent := os.environ.pop(PARENT, None)) is not None and os.name == "posix":
+        stop_with(int(parent))
 
 
 @contextmanager
@@ -161,6 +169,24 @@ def stop_request() -> Iterator[StopRequest]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def stop_with(parent: int, clean: Callable[[], None] | None = None) -> None:
+    """Stop this process as by SIGTERM once its parent is gone, even if that was killed: nobody else would stop it.
+
+    Args:
+        parent: number of that process.
+        clean: called first.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(POLL)
+        if clean is not None:
+            clean()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def _is_first(number: int) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from dataclasses import dataclass
 
 from lapgs_plugin.errors import UserInputError
@@ -71,11 +72,29 @@ VIEW_PIXELS = Limit("LAPGS_MAX_VIEW_PIXELS", 128_000_000, "pixels")
 FRAMES = Limit("LAPGS_MAX_FRAMES", 100_000, "frames")
 """Longest camera path. An hour of video at 24 frames a second has 86,400 frames."""
 
+_torch_threads = threading.Lock()
+
 LONGEST_NAME = 255
 """Longest file name in bytes on common file systems."""
 
 LONGEST_STEM = 230
 """Longest name in bytes that leaves room for suffixes, such as those of attempts, logs and temporary files."""
+
+
+def use_one_torch_thread() -> None:
+    """Run PyTorch's operations in the calling thread alone, for threads of a pool that would compete with PyTorch's.
+
+    PyTorch's number is that of the calling thread and of threads that begin to use PyTorch later. Another thread
+    restores it for these.
+    """
+    import torch  # not with this file, which all commands read
+
+    with _torch_threads:
+        others = torch.get_num_threads()  # as of any new thread; not asked now, it would be adopted later
+        torch.set_num_threads(1)
+        restoring = threading.Thread(target=torch.set_num_threads, args=(others,))
+        restoring.start()
+        restoring.join()
 
 
 def usable_processors() -> int:

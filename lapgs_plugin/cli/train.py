@@ -70,15 +70,18 @@ class StartOptions:
     def __post_init__(self) -> None:
         if self.gpus is not None and self.processes is not None:
             raise UserInputError(f"--gpus {self.gpus} with --processes {self.processes}: give one of them")
-        if self.tiling.asked is not None:
-            asked: dict[str, int | bool | None] = {"--shard": self.shard, "--view": self.viewing.view}
-            if self.tiling.tile is not None or self.tiling.only_base:
-                asked |= {"--gpus": self.gpus, "--processes": self.processes}
-            for name, value in asked.items():
-                if value:
-                    raise UserInputError(f"{name} with {self.tiling.asked}: not for tiles; leave one out")
-        if self.shard:
+        if self.shard and self.tiling.asked is None:
             self._check_shard()
+
+    def require_for_tiles(self, out: Path) -> None:
+        """Refuse options that runs of tiles do not have, of a new run and of a continued one."""
+        asked: dict[str, int | bool | None] = {"--shard": self.shard, "--view": self.viewing.view}
+        if self.tiling.tile is not None or self.tiling.only_base:
+            asked |= {"--gpus": self.gpus, "--processes": self.processes}
+        for name, value in asked.items():
+            if value:
+                tiles = self.tiling.asked or f"{out}, which is made of tiles"
+                raise UserInputError(f"{name} with {tiles}: not for tiles; leave {name} out")
 
     def _check_shard(self) -> None:
         """Refuse to divide Gaussians over one rank, or to show them while they are divided."""
@@ -173,6 +176,8 @@ def train(
     from lapgs_plugin.training.ranks.group import joined
 
     in_tiles = start.tiling.asked is not None or (start.resume and has_grid(out))
+    if in_tiles:
+        start.require_for_tiles(out)
     if not isinstance(context.obj, Rehearsal) and not in_tiles and start.launches(control.rasterizer):
         return
     if leads := launcher.leads():
@@ -264,8 +269,6 @@ def _trained_in_tiles(context: typer.Context, request: TrainRequest, start: Star
         )
     if tiling.tiles is None and not continues:
         return False
-    if start.shard:
-        raise UserInputError(f"--shard: {out} is made of tiles, which are not divided further; leave it out")
     shape = None if tiling.tiles is None else tiling.shape
     queue, workers = say if tiling.only_base else None, start.workers(request.control.rasterizer)
     if workers is not None:

@@ -32,10 +32,10 @@ class EventFile:
     Args:
         path: of the file, with the event by which it begins.
         folder: of the file, as the script named it.
-        gathers: returns whether more events follow at once, and then a call of `flush`.
+        gathers: called with this object after each event; returns whether a call of `flush` follows.
     """
 
-    def __init__(self, path: Path, folder: str, gathers: Callable[[], bool]) -> None:
+    def __init__(self, path: Path, folder: str, gathers: Callable[[EventFile], bool]) -> None:
         self._path, self._folder, self._gathers = path.absolute(), folder, gathers  # the script may change its folder
         self._pending = _Pending(path.stat().st_size, [])
         self._scalars: dict[str, tuple[Any, Any]] = {}  # by tag an event, and the value in it
@@ -47,19 +47,16 @@ class EventFile:
 
     def add_event(self, event: Any) -> None:
         """Add an event."""
-        self._add(event)
-        if not self._gathers():
+        with self._lock:
+            self._pending.events.append(event.SerializeToString())
+        if not self._gathers(self):
             self.flush()
 
     def add_scalar(self, tag: str, number: float, step: int, walltime: float) -> None:
-        """Add the event that a `SummaryWriter` makes of a number; `flush` writes it."""
+        """Add the event that a `SummaryWriter` makes of a number."""
         event, value = self._scalars.get(tag) or self._add_tag(tag)
         event.step, event.wall_time, value.simple_value = step, walltime, number
-        self._add(event)
-
-    def _add(self, event: Any) -> None:
-        with self._lock:
-            self._pending.events.append(event.SerializeToString())
+        self.add_event(event)
 
     def _add_tag(self, tag: str) -> tuple[Any, Any]:
         from tensorboard.compat.proto.event_pb2 import Event

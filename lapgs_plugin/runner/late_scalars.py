@@ -36,7 +36,7 @@ class LateScalars:
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[Any, Callable[[], None]]] = deque()  # writers, and what gives a scalar to each
-        self._files: list[EventFile] = []
+        self._unflushed: dict[EventFile, None] = {}  # in the order of their first events
         self._writing = False
 
     def replacements(self) -> list[Replacement]:
@@ -72,10 +72,15 @@ class LateScalars:
             if not path.is_file():  # its folder is on another machine
                 return writer
             writer.close()
-            self._files.append(EventFile(path, writer.get_logdir(), lambda: self._writing))
-            return self._files[-1]
+            return EventFile(path, writer.get_logdir(), self._gathers)
 
         return event_file
+
+    def _gathers(self, file: EventFile) -> bool:
+        """Return whether scalars are being written, after which this file is flushed."""
+        if self._writing:
+            self._unflushed[file] = None
+        return self._writing
 
     def _late(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
@@ -129,8 +134,9 @@ class LateScalars:
                 self._waiting.popleft()  # not before its file has it: a signal may end this function
         finally:
             self._writing = False
-            for file in self._files:
+            for file in list(self._unflushed):
                 file.flush()
+                self._unflushed.pop(file, None)
 
     def _finish(self) -> None:
         writers = {writer for writer, _ in self._waiting}

@@ -33,7 +33,7 @@ from torch import Tensor
 from lapgs_plugin.errors import TrainingDivergedError, UserInputError
 from lapgs_plugin.files import one_line_errors
 from lapgs_plugin.hierarchy.settings import AUTO, PLACES, PRECISIONS
-from lapgs_plugin.limits import usable_processors
+from lapgs_plugin.limits import usable_processors, use_one_torch_thread
 from lapgs_plugin.ops.mixed_sizes import stack_padded
 
 DTYPES: dict[str, torch.dtype] = {name: getattr(torch, name) for name in PRECISIONS}
@@ -147,8 +147,7 @@ class ImageStore:
         self._loaders = ThreadPoolExecutor(
             max_workers=max(LOADERS, min(MOST_LOADERS, usable_processors())),
             thread_name_prefix="image-store",
-            initializer=torch.set_num_threads,  # torch's own threads would compete with these
-            initargs=(1,),
+            initializer=use_one_torch_thread,
         )
         self._staging = threading.local()
         self._255 = torch.tensor(255.0, device=self._device)

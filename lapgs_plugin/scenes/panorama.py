@@ -9,11 +9,18 @@ from lapgs_plugin.scenes.source import ALL_AROUND
 
 ROUNDED = 2
 """Largest difference in pixels of a panorama's width from twice its height, because programs round either."""
+ALMOST = 0.02
+"""Largest relative difference of the two that may be that of a panorama which lost rows or was resized."""
 
 
 def is_panorama(size: tuple[int, int]) -> bool:
     """Return whether a photo of this width and height can show all around."""
     return abs(size[0] - 2 * size[1]) <= ROUNDED
+
+
+def may_be_panorama(size: tuple[int, int]) -> bool:
+    """Return whether a photo of this width and height is about twice as wide as high."""
+    return abs(size[0] - 2 * size[1]) <= ALMOST * size[0]
 
 
 def panorama_lens(size: tuple[int, int], where: str) -> pycolmap.Camera:

@@ -8,9 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-import torch
-
-from lapgs_plugin.limits import usable_processors
+from lapgs_plugin.limits import usable_processors, use_one_torch_thread
 from lapgs_plugin.progress import item_progress
 
 ProgressCallback = Callable[[int, int], None]
@@ -102,5 +100,4 @@ def readers_of(sizes: Iterable[tuple[int, int]]) -> int:
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    # One thread an item: torch's own threads would compete with these.
-    return ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(threads, initializer=use_one_torch_thread)

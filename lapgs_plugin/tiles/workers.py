@@ -62,7 +62,8 @@ class _Running:
 def train_apart(tiles: Sequence[Tile], workers: Workers, control: TrainingControl) -> None:
     """Train tiles by their commands, as many at a time as there are workers. Finished ones end at once.
 
-    On an error or a signal the running commands get SIGTERM, write their checkpoints, and are waited for.
+    On an error or a signal the running commands get SIGTERM, write their checkpoints, and are waited for. They stop
+    by themselves in the same way if this process is killed.
 
     Args:
         tiles: to train.
@@ -97,7 +98,7 @@ def _start(tile: Tile, device: str, control: TrainingControl) -> _Running:
     """Start the command of a tile, which writes its output into the tile's folder."""
     tile.folder.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "lapgs_plugin", *tile.words(control), "--resume"]
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": device}
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": device, interrupt.PARENT: str(os.getpid())}
     with (tile.folder / TILE_LOG).open("ab") as log:
         process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
     return _Running(tile, device, process)

@@ -57,6 +57,12 @@ def fields_of(run: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted(run.glob(f"**/{PLY}"))]
 
 
+def resuming(scene: Path, run: Path) -> list[str]:
+    """Return the command that continues a run with two tiles at the same time."""
+    words = ["train", str(scene), "-o", str(run), "--resume", "--processes", "2"]
+    return [sys.executable, "-m", "lapgs_plugin", *words]
+
+
 def tile_commands(printed: str) -> list[list[str]]:
     return [shlex.split(line)[1:] for line in printed.splitlines()]
 
@@ -134,8 +140,7 @@ def test_sigterm_reaches_running_tiles_which_write_checkpoints(tmp_path: Path, s
     run = tmp_path / "run"
     longer = (*OPTIONS, "--iterations", "1200")  # so that no tile ends before the other has begun
     lapgs("train", scene, "-o", run, *longer, "--tiles", "1x2", "--only-base")
-    command = [sys.executable, "-m", "lapgs_plugin", "train", scene, "-o", run, "--resume", "--processes", "2"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(resuming(scene, run), stderr=subprocess.PIPE, text=True) as parent:
         histories = [run / folder / HISTORY for folder in TILE_FOLDERS]
         wait_for(lambda: all(path.exists() and path.stat().st_size for path in histories))
         parent.send_signal(signal.SIGTERM)
@@ -145,6 +150,19 @@ def test_sigterm_reaches_running_tiles_which_write_checkpoints(tmp_path: Path, s
     assert all((run / folder / CHECKPOINT).exists() for folder in TILE_FOLDERS)
     lapgs("train", scene, "-o", run, "--resume", "--processes", "2")
     assert RunArchive.open(run).manifest.complete
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX signals")
+def test_tiles_whose_command_was_killed_stop_with_checkpoints(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
+    run = tmp_path / "run"
+    lapgs("train", scene, "-o", run, *OPTIONS, "--iterations", "1200", "--tiles", "1x2", "--only-base")
+    with subprocess.Popen(resuming(scene, run), stderr=subprocess.DEVNULL) as parent:
+        histories = [run / folder / HISTORY for folder in TILE_FOLDERS]
+        wait_for(lambda: all(path.exists() and path.stat().st_size for path in histories))
+        parent.kill()
+    logs = [run / folder / TILE_LOG for folder in TILE_FOLDERS]
+    wait_for(lambda: all("a checkpoint is in" in log.read_text() for log in logs))
+    assert all((run / folder / CHECKPOINT).exists() for folder in TILE_FOLDERS)
 
 
 def test_a_tile_without_views_keeps_the_base(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
@@ -177,10 +195,13 @@ def test_bad_requests(tmp_path: Path, scene: Path, lapgs: Lapgs) -> None:
     tiles = ("train", scene, "-o", out, *OPTIONS, "--tiles", "1x2")
     assert "--gpus 99" in lapgs(*tiles, "--gpus", "99", fails=True)
     assert "--processes" in lapgs(*tiles, "--only-base", "--processes", "2", fails=True)
+    assert "--shard with --tiles" in lapgs(*tiles, "--shard", fails=True)
     assert "--refine-poses" in lapgs(
         "train", scene, "-o", out, *OPTIONS, "--tiles", "2x1", "--refine-poses", fails=True
     )
     lapgs("train", scene, "-o", run, *OPTIONS, "--tiles", "1x2", "--only-base")
+    for option in (["--shard", "--processes", "2"], ["--view"]):
+        assert f"{option[0]} with {run}" in lapgs("train", scene, "-o", run, "--resume", *option, fails=True)
     tile = ("--tile", "0,1", "--base", run)
     assert "has 1x2 tiles" in lapgs("train", scene, "-o", out, "--tile", "0,2", "--base", run, fails=True)
     assert "--iterations with --tile" in lapgs("train", scene, "-o", out, *tile, "--iterations", "9", fails=True)

@@ -36,7 +36,7 @@ def test_a_file_is_that_of_tensorboard(tmp_path: Path) -> None:
     ours = tmp_path / "ours"
     ours.write_bytes(path.read_bytes())
     many = [True]
-    file = EventFile(ours, "folder", lambda: many[0])
+    file = EventFile(ours, "folder", lambda file: many[0])
     for event in events:
         reference.add_event(event)
         file.add_event(event)
@@ -50,7 +50,7 @@ def test_a_file_is_that_of_tensorboard(tmp_path: Path) -> None:
 def test_threads_add_events(tmp_path: Path) -> None:
     path = tmp_path / "events"
     path.touch()
-    file = EventFile(path, str(tmp_path), lambda: False)
+    file = EventFile(path, str(tmp_path), lambda file: False)
 
     def add(first: int) -> None:
         for step in range(first, first + 50):
@@ -70,7 +70,7 @@ def test_a_file_stays_the_same_one_when_the_script_changes_its_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("events").touch()
-    file = EventFile(Path("events"), ".", lambda: False)
+    file = EventFile(Path("events"), ".", lambda file: False)
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path / "other")
     file.add_event(Event(step=3))
@@ -85,7 +85,7 @@ def test_events_are_in_the_file_once_after_a_write_that_was_ended(
     """By a full disk in the middle of an event, or by a signal after the last one."""
     path, gathers = tmp_path / "events", [True]
     path.touch()
-    file = EventFile(path, str(tmp_path), lambda: gathers[0])
+    file = EventFile(path, str(tmp_path), lambda file: gathers[0])
     for step in range(3):
         file.add_event(Event(step=step, wall_time=step + 0.5))
     opened = Path.open

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment
 from lapgs_plugin.runner import late_scalars
+from lapgs_plugin.runner.event_files import EventFile
 from lapgs_plugin.runner.late_numbers import LateNumber
 from lapgs_plugin.runner.late_scalars import LateScalars
 
@@ -88,6 +90,31 @@ def test_files_grow_with_their_events(tmp_path: Path, monkeypatch: pytest.Monkey
         assert len(events) == 26
     writer.add_scalar("loss", 0.5, 25)  # after training
     assert len(events_of(tmp_path)[0]) == 27
+
+
+def test_closed_files_are_forgotten(tmp_path: Path) -> None:
+    """So that a script that opens a writer again and again does not take more and more memory."""
+
+    def open_files() -> int:
+        gc.collect()
+        return sum(isinstance(held, EventFile) for held in gc.get_objects())
+
+    before = open_files()
+    with late():
+        for turn in range(3):
+            writer = SummaryWriter(str(tmp_path / str(turn)))
+            writer.add_scalar("loss", LateNumber(lambda: 0.5), turn)
+            assert open_files() == before + 1
+            writer.close()
+            assert open_files() == before
+    assert [losses_of(tmp_path / str(turn)) for turn in range(3)] == [[(turn, 0.5)] for turn in range(3)]
+
+
+def test_a_writer_that_is_dropped_loses_nothing(tmp_path: Path) -> None:
+    with late():
+        SummaryWriter(str(tmp_path)).add_scalar("loss", LateNumber(lambda: 0.5), 1)
+        gc.collect()
+    assert losses_of(tmp_path) == [(1, 0.5)]
 
 
 def test_a_writer_from_before_training(tmp_path: Path) -> None:

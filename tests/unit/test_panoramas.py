@@ -521,3 +521,20 @@ def test_a_tripod_without_panoramas_is_one_line(tmp_path: Path) -> None:
     names, poses = blank(tmp_path / "in/images", size=(60, 40)), tilted()
     transforms(tmp_path / "in", names, poses, camera_model="OPENCV", fl_x=50.0, k1=0.1)
     refuses(UserInputError, "--tripod 30: .* has no panoramas", run, tmp_path / "in", tmp_path / "out", tripod=30)
+
+
+def test_photos_that_may_be_panoramas_are_asked_about(tmp_path: Path) -> None:
+    """That those are not which have a focal length, another shape, or a camera model is seen by what refuses them."""
+    out, folder = tmp_path / "out", tmp_path / "in"
+    for name in ("a.jpg", "b.jpg"):
+        save(folder / name, RANDOM.random((198, 400, 3)))
+    may_be = "in: photos of 400x198 pixels, almost twice as wide as high .*; give --camera-model OPENCV if"
+    refuses(SceneError, may_be, run, folder, out)
+    assert not out.exists()
+    ordinary = "--tripod 9: .*in has no panoramas"
+    refuses(UserInputError, ordinary, run, folder, out, tripod=9, camera_model="OPENCV")
+    metadata(folder, "a.jpg", b"focal")
+    refuses(UserInputError, ordinary, run, folder, out, tripod=9)
+    for name in ("a.jpg", "b.jpg"):
+        save(folder / name, RANDOM.random((190, 400, 3)))  # 2.1:1
+    refuses(UserInputError, ordinary, run, folder, out, tripod=9)

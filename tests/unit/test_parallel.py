@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
+import torch
 
+from lapgs_plugin.runs.image_store import ImageStore
 from lapgs_plugin.scenes import parallel
 from lapgs_plugin.scenes.parallel import ahead, readers_of
 
@@ -52,6 +56,23 @@ def test_several_items_are_worked_on_at_once() -> None:
     """Both wait for each other, so that neither would return alone."""
     meeting = threading.Barrier(2, timeout=20)
     assert list(ahead(lambda _: meeting.wait() >= 0, range(4), most=2)) == [True] * 4
+
+
+def torch_threads(_: object = None) -> int:
+    """Return how many threads PyTorch's next operation may use, after one that may use several."""
+    torch.ones(200_000).exp_()
+    return torch.get_num_threads()
+
+
+def test_torch_threads_are_limited_in_the_pools_alone(tmp_path: Path) -> None:
+    """Threads that start later have as many as before."""
+    torch.set_num_threads(3)
+    numbers, store = list(ahead(torch_threads, range(40), most=4)), ImageStore("disk", "float32", folder=tmp_path)
+    store.put_reader("a", (3, 1, 1), lambda: torch.full((3, 1, 1), float(torch_threads())))
+    assert {*numbers, int(store.get("a").max())} == {1}
+    store.close()
+    with ThreadPoolExecutor(1) as later:
+        assert later.submit(torch_threads).result() == torch_threads() == 3
 
 
 def test_the_error_of_the_first_item_is_raised_after_the_results_before_it() -> None:

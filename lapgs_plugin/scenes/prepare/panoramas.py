@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.scenes.images import read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
-from lapgs_plugin.scenes.panorama import is_panorama, panorama_lens
+from lapgs_plugin.scenes.panorama import is_panorama, may_be_panorama, panorama_lens
 from lapgs_plugin.scenes.prepare.colmap import Attempt, chosen_matcher, find_features, map_photos, match_pairs
 from lapgs_plugin.scenes.prepare.job import Job
 from lapgs_plugin.scenes.prepare.photos import Photos, camera_of, listed, says_all_around, target_name
@@ -37,11 +37,14 @@ def are_panoramas(job: Job, sizes: Mapping[str, tuple[int, int]]) -> bool:
     Those are that say so, and those twice as wide as high without a focal length, unless a camera model is asked for.
 
     Raises:
-        SceneError: some are and others are not, one does not show all around, or they differ in size.
+        SceneError: some are and others are not, one does not show all around, they differ in size, or all are almost
+            twice as wide as high, so that they may be.
         UserInputError: an option does not concern such photos.
     """
     asked = job.settings.camera_model
     around = [name for name, size in sizes.items() if asked == ALL_AROUND or _is_around(job.photo(name), size)]
+    if asked == AUTO and not around:
+        _require_decided(job, sizes)
     if asked not in (AUTO, ALL_AROUND) or not around:
         if job.settings.tripod:
             raise UserInputError(
@@ -74,8 +77,28 @@ def are_panoramas(job: Job, sizes: Mapping[str, tuple[int, int]]) -> bool:
 
 
 def _is_around(photo: Path, size: tuple[int, int]) -> bool:
+    return says_all_around(photo) or (is_panorama(size) and not _has_focal_length(photo))
+
+
+def _require_decided(job: Job, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse photos of which nothing says whether they are panoramas: placing them as the wrong kind takes long.
+
+    Raises:
+        SceneError: all are almost twice as wide as high, and none has a focal length.
+    """
+    if not all(may_be_panorama(size) and not _has_focal_length(job.photo(name)) for name, size in sizes.items()):
+        return
+    width, height = next(iter(sizes.values()))
+    raise SceneError(
+        f"{job.source.clip or job.source.folder}: photos of {width}x{height} pixels, almost twice as wide as high and "
+        "without a focal length, expected to know whether they are panoramas; give --camera-model OPENCV if they are "
+        "ordinary photos, else export whole panoramas of 360x180 degrees, twice as wide as high"
+    )
+
+
+def _has_focal_length(photo: Path) -> bool:
     _, _, *focal = camera_of(photo)
-    return says_all_around(photo) or (is_panorama(size) and not any(focal))
+    return any(focal)
 
 
 def place_panoramas(job: Job, size: tuple[int, int]) -> tuple[pycolmap.Reconstruction, int]:

@@ -32,7 +32,7 @@ STOPPED = tuple(128 + number for number in interrupt.SIGNALS)
 GRACE = 20.0
 """Seconds that a rank has to end after a signal: it may wait in a GPU's queue for a rank that is gone."""
 POLL = 0.2
-"""Seconds between two looks of the agent at its ranks, and of a rank at its agent."""
+"""Seconds between two looks of the agent at its ranks."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def join_started(option: str, asked: int | None) -> None:
             f"{option} {asked}: torchrun started {started} ranks; leave the option out, or give {started}"
         )
     _end_when_stuck()
-    threading.Thread(target=_stop_without_agent, name="agent", daemon=True).start()
+    interrupt.stop_with(os.getppid(), _remove_reports)
 
 
 def leads() -> bool:
@@ -115,14 +115,10 @@ def _end_when_stuck() -> None:
     threading.Thread(target=watch, name="signals", daemon=True).start()
 
 
-def _stop_without_agent() -> None:
-    """Stop this process as by SIGTERM once the agent that started it is gone: nobody else would end the ranks."""
-    agent = os.getppid()
-    while os.getppid() == agent:
-        time.sleep(POLL)
+def _remove_reports() -> None:
+    """Remove the folder of reports, which an agent that was killed leaves behind."""
     if (folder := os.environ.get(REPORTS)) is not None:
         shutil.rmtree(folder, ignore_errors=True)
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def require_gpus(count: int, rasterizer: str) -> None:
