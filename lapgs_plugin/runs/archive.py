@@ -48,6 +48,10 @@ Poses = dict[str, Annotated[list[float], Field(min_length=6, max_length=6)]]
 """Corrections of poses by photo, as `fields.pose` describes them: a rotation vector, and a shift in world units."""
 
 
+REMEMBERED_BYTES = 1 << 30
+"""Most bytes of a field that is remembered."""
+
+
 class RunArchive(RunFiles):
     """Write and read one run folder. One process at a time may write to it; any number may read.
 
@@ -56,6 +60,12 @@ class RunArchive(RunFiles):
     not writable, and leave the previous file as it was. A folder with links among its entries is not opened for
     writing; reading follows links to files.
     """
+
+    def __init__(self, folder: Path, manifest: Manifest, lock: FolderLock | None) -> None:
+        super().__init__(folder, manifest, lock)
+        # The level that was finished last, as its PLY has it: the next one starts from it, renders it for all views and
+        # trains it along, and each reading of it takes as long as some hundred iterations.
+        self._remembered: dict[int, GaussianField] = {}
 
     @classmethod
     def create(
@@ -147,13 +157,15 @@ class RunArchive(RunFiles):
         return self.path(f"level_{level}", TRAINED_ALONG.format(later))
 
     def field(self, level: int) -> GaussianField:
-        """Read the field of a finished level, float32 on the CPU.
+        """Return the field of a finished level, float32 on the CPU. It must not be written to.
 
         Raises:
             RunFolderError: the level is not finished, or its PLY disagrees with the manifest.
         """
         record = self._manifest.record(level)
         self._require_file(record)
+        if level in self._remembered:
+            return self._remembered[level]
         try:
             loaded = GaussianField.load_ply(self.field_path(level))
         except FieldError as error:
@@ -223,6 +235,7 @@ class RunArchive(RunFiles):
         record = replace(record, overhead_seconds=dict(overhead))
         self._write_manifest(replace(self._manifest, records=(*self._manifest.records, record)))
         self._settle_fields()
+        self._remembered = _copied(record, field)
         with one_line_errors(self._folder):
             self.path(CHECKPOINT).unlink(missing_ok=True)
             self.path(f"level_{record.level + 1}", OPTIMIZER).unlink(missing_ok=True)
@@ -409,3 +422,14 @@ def _require_field_of(record: LevelRecord, field: GaussianField) -> None:
         field.require_finite()
     except FieldError as error:
         raise FieldError(f"level {record.level}: {error}") from error
+
+
+def _copied(record: LevelRecord, field: GaussianField) -> dict[int, GaussianField]:
+    """Return by its level a copy of a field that is to be remembered: none of a large one, or of the finest level."""
+    if record.level == 0 or sum(tensor.nbytes for tensor in field.parameters.values()) > REMEMBERED_BYTES:
+        return {}
+    copies = {
+        name: tensor.detach().to("cpu", torch.float32, copy=True).contiguous()
+        for name, tensor in field.parameters.items()
+    }
+    return {record.level: replace(field.with_parameters(copies), signed=record.signed)}

@@ -76,6 +76,23 @@ def assert_level_is_whole(archive: RunArchive, level: int) -> None:
     assert all(torch.equal(loaded.parameters[name], tensor) for name, tensor in expected.parameters.items())
 
 
+def test_the_field_finished_last_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[Path] = []
+    load = GaussianField.load_ply
+    monkeypatch.setattr(GaussianField, "load_ply", lambda path: [reads.append(path), load(path)][1])
+    with RunArchive.create(tmp_path / "run", manifest()) as archive:
+        field = level_field(1)
+        archive.finish_level(record(1), field)
+        field.means.zero_()  # a trainer goes on with its tensors
+        assert_level_is_whole(archive, 1)
+        assert reads == []
+        along = level_field(1)
+        archive.finish_level(record(0), level_field(0), trained_along={1: along.with_parameters({"sh": 2 * along.sh})})
+        assert torch.equal(archive.field(1).sh, 2 * along.sh), "the field that was trained along counts"
+        assert [path.parent.name for path in reads] == ["level_1"]
+    assert_level_is_whole(RunArchive.open(tmp_path / "run"), 0)
+
+
 def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
     with RunArchive.create(tmp_path / "deep" / "run", manifest()) as archive:
         assert (archive.available_levels, archive.manifest.complete, archive.manifest.next_level) == ((), False, 1)
