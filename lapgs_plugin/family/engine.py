@@ -30,6 +30,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     if device.type not in ENGINES:
         raise UserInputError(f"means3D is on {device}: expected {' or '.join(ENGINES)}")
     _check(settings, inputs)
+    _check_pixels(settings, options)
     engine: Any = import_module(ENGINES[device.type])
     output: Output = engine.rasterize(settings, inputs, options)
     return output
@@ -74,4 +75,15 @@ def _check(settings: Settings, inputs: Inputs) -> None:
             f"SH coefficients are {(*sh.shape[:1], count, *sh.shape[2:])}, {sh.dtype}, on {sh.device} at sh_degree "
             f"{degree}: expected ({n}, k, 3), torch.float32, on {device}, k of 1, 4, 9 or 16 and at least "
             "(degree + 1)^2, dc included"
+        )
+
+
+def _check_pixels(settings: Settings, options: Options) -> None:
+    """Refuse a background and weights that kernels would read out of bounds."""
+    if settings.bg.numel() != 3:
+        raise UserInputError(f"bg is {tuple(settings.bg.shape)}: expected (3,)")
+    weights, width, height = options.pixel_weights, int(settings.image_width), int(settings.image_height)
+    if weights is not None and weights.numel() != width * height:
+        raise UserInputError(
+            f"{weights.numel()} weights of pixels: expected {width * height}, for an image of {width}x{height}"
         )

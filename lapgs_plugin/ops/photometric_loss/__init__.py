@@ -77,7 +77,11 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     """Return SSIM of each pixel and channel of float32 images (b, c, h, w), differentiable by the prediction.
 
     The window is an 11x11 Gaussian of sigma 1.5, with zeros outside of the images.
+
+    Raises:
+        UserInputError: as `photometric_loss`; the target may require a gradient, and gets none.
     """
+    check_arguments(prediction, target.detach(), 1.0)
     if prediction.shape[1] == 3 and triton_works(prediction, target):
         from lapgs_plugin.ops.photometric_loss.in_triton import ssim_map_triton
 
