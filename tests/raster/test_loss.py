@@ -176,6 +176,19 @@ def test_gradient_scales_with_what_comes_back() -> None:
     torch.testing.assert_close(scaled, 3 * gradient)
 
 
+@pytest.mark.parametrize("views", [(), (2,)])
+def test_a_loss_is_differentiated_again_after_its_gradient_was_changed_in_place(views: tuple[int, ...]) -> None:
+    prediction, target = torch.rand(2, *views, 3, 20, 23, generator=torch.Generator().manual_seed(0))
+    prediction.requires_grad_()
+    loss = photometric_loss(prediction, target)
+    (expected,) = torch.autograd.grad(loss, prediction, retain_graph=True)
+    expected = expected.clone()
+    for times in (1, 2, 3):
+        loss.backward(retain_graph=True)  # type: ignore[no-untyped-call]  # torch's
+        assert prediction.grad is not None
+        torch.testing.assert_close(prediction.grad, times * expected)
+
+
 def test_images_need_not_be_contiguous() -> None:
     p, t = images((3, 20, 30))
     loss, gradient = loss_and_gradient(p, t, 0.2)
