@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,6 +89,17 @@ def test_auto_makes_tiles_by_the_views(views: int, count: int) -> None:
     rows, columns = TileGrid.of(street(views), None).shape
     assert rows * columns >= count
     assert rows * (columns - 1) < count
+
+
+def test_memory_does_not_grow_with_the_square_of_the_views() -> None:
+    scene = street(1700)
+    tracemalloc.start()
+    try:
+        TileGrid.of(scene, (2, 2))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 * len(scene.train) ** 2 / 4  # bytes; 1e6 seen
 
 
 def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
