@@ -42,7 +42,7 @@ def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
 
 
 def _check(settings: Settings, inputs: Inputs) -> None:
-    """Refuse tensors that kernels would read out of bounds."""
+    """Refuse tensors that kernels would read out of bounds, or whose gradients they would write there."""
     n, device = inputs.means.shape[0], inputs.means.device
     wanted = (
         ("means3D", inputs.means, (n, 3)),
@@ -59,6 +59,8 @@ def _check(settings: Settings, inputs: Inputs) -> None:
                 f"{name} is {tuple(tensor.shape)}, {tensor.dtype}, on {tensor.device}: "
                 f"expected {shape}, torch.float32, on {device}"
             )
+    if inputs.means2d.shape not in ((n, 3), (n, 4)):
+        raise UserInputError(f"means2D is {tuple(inputs.means2d.shape)}: expected {(n, 3)} or {(n, 4)}")
     degree, sh = int(settings.sh_degree) & ~SIGNED_COLOR_BIT, inputs.sh
     if sh is None:
         return

@@ -41,7 +41,7 @@ LEAST_ROOM = 2**14
 MOST_PAIRS = 2**31 - 2**9
 """Most pairs whose places our kernels can number."""
 
-_rooms: dict[tuple[Any, ...], float] = {}  # by device, size and number of images; estimates
+_rooms: dict[tuple[Any, ...], float] = {}  # by device, size, and number of images or rules; estimates
 
 
 def blend_in_tiles(

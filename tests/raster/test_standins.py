@@ -396,6 +396,10 @@ def test_arguments_that_do_not_fit_are_refused() -> None:
         call(module, "graphdeco", case, activated(case) | {"shs": torch.zeros(3, 4, 3)})
     with pytest.raises(UserInputError, match="focal lengths"):
         call(module, "graphdeco", case, activated(case), tanfovx=0.1)
+    settings = settings_of(module, case.camera, case.background, 3)
+    for shape in ((3, 2), (2, 3), (9,)):
+        with pytest.raises(UserInputError, match=r"means2D is .* expected \(3, 3\) or \(3, 4\)"):
+            module.GaussianRasterizer(settings)(means2D=torch.zeros(shape), **activated(case))
     with pytest.raises(UserInputError, match=r"bg is \(1,\).* expected \(3,\)"):
         call(module, "graphdeco", case, activated(case), bg=torch.zeros(1))
     marked = {"get_flag": True, "metric_map": torch.ones(7, dtype=torch.int32)}
