@@ -36,8 +36,8 @@ def photometric_loss(
         sizes: (width, height) of several views, each in the top left of its image; None if they are whole.
 
     Raises:
-        UserInputError: the images differ in shape, their channels come last, the target requires a gradient, the
-            weight leaves [0, 1], or the prediction is on a CPU and neither float32 nor float64.
+        UserInputError: the images differ in shape or device, their channels come last, the target requires a gradient,
+            the weight leaves [0, 1], or the prediction is on a CPU and neither float32 nor float64.
     """
     check_arguments(prediction, target, ssim_weight)
     if prediction.shape[-3] == 3 and triton_works(prediction):

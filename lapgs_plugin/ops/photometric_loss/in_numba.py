@@ -270,7 +270,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
         A scalar of the images' type, the same bits for any number of threads.
 
     Raises:
-        UserInputError: as `check_arguments`; or an image is on a GPU, or of another type than the other.
+        UserInputError: as `check_arguments`; or images are on a GPU, or one is of another type than the other.
     """
     check_arguments(prediction, target, ssim_weight)
     if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
@@ -278,9 +278,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
             f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
             "convert one with .to(dtype)"
         )
-    if prediction.device.type != "cpu" or target.device.type != "cpu":
-        raise UserInputError(
-            f"prediction on {prediction.device} and target on {target.device}: expected the CPU; move them with .cpu()"
-        )
+    if prediction.device.type != "cpu":
+        raise UserInputError(f"images on {prediction.device}: expected the CPU; move them with .cpu()")
     loss: Tensor = _PhotometricLoss.apply(prediction, target, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss
