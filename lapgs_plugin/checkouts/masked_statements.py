@@ -28,6 +28,8 @@ VISIBLE = "_lapgs_visible"
 """Name of the function that takes the place of `(radii > 0).nonzero()`."""
 KEY = "visibility_filter"
 """Name of the mask, or of its indices, in the results of the family's renderers."""
+CALLERS = ("partial", "map")
+"""Functions by which a function calls another one itself, under no name."""
 LARGEST = ("max", "maximum")
 """Functions of torch that return the larger one of two tensors' elements."""
 
@@ -262,9 +264,11 @@ def keeps_masks(function: ast.FunctionDef, renderers: Collection[str], methods: 
     """
     nodes = list(ast.walk(function))
     parents = {child: node for node in nodes for child in ast.iter_child_nodes(node)}
+    if not all(_is_called_by_name(node, parents) for node in nodes if _name_of(node) in renderers):
+        return False
     results = set()
     for node in nodes:
-        if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", None)) in renderers:
+        if isinstance(node, ast.Call) and _name_of(node.func) in renderers:
             match parents[node]:
                 case ast.Assign(targets=[ast.Name(name)]):
                     results.add(name)
@@ -282,6 +286,21 @@ def keeps_masks(function: ast.FunctionDef, renderers: Collection[str], methods: 
                 case _:
                     return False
     return all(mask is not None and only_updates_by(function, mask, methods) for mask in masks)
+
+
+def _name_of(node: ast.AST) -> str | None:
+    """Return the name of a variable or an attribute; None for other nodes."""
+    return getattr(node, "id", getattr(node, "attr", None))
+
+
+def _is_called_by_name(renderer: ast.AST, parents: Mapping[ast.AST, ast.AST]) -> bool:
+    """Return whether a function calls a renderer where it names it, or gives it to another function, which calls it."""
+    parent = parents[renderer]
+    if isinstance(parent, ast.keyword):
+        parent = parents[parent]
+    if not isinstance(parent, ast.Call):
+        return False
+    return parent.func is renderer or _name_of(parent.func) not in CALLERS
 
 
 def _variable(value: ast.expr, parents: Mapping[ast.AST, ast.AST]) -> str | None:

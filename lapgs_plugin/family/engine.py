@@ -30,6 +30,7 @@ def rasterize(settings: Settings, inputs: Inputs, options: Options) -> Output:
     if device.type not in ENGINES:
         raise UserInputError(f"means3D is on {device}: expected {' or '.join(ENGINES)}")
     _check(settings, inputs)
+    _check_pixels(settings, options)
     engine: Any = import_module(ENGINES[device.type])
     output: Output = engine.rasterize(settings, inputs, options)
     return output
@@ -41,7 +42,7 @@ def mark_visible(settings: Settings, positions: Tensor) -> Tensor:
 
 
 def _check(settings: Settings, inputs: Inputs) -> None:
-    """Refuse tensors that kernels would read out of bounds."""
+    """Refuse tensors that kernels would read out of bounds, or whose gradients they would write there."""
     n, device = inputs.means.shape[0], inputs.means.device
     wanted = (
         ("means3D", inputs.means, (n, 3)),
@@ -58,6 +59,8 @@ def _check(settings: Settings, inputs: Inputs) -> None:
                 f"{name} is {tuple(tensor.shape)}, {tensor.dtype}, on {tensor.device}: "
                 f"expected {shape}, torch.float32, on {device}"
             )
+    if inputs.means2d.shape not in ((n, 3), (n, 4)):
+        raise UserInputError(f"means2D is {tuple(inputs.means2d.shape)}: expected {(n, 3)} or {(n, 4)}")
     degree, sh = int(settings.sh_degree) & ~SIGNED_COLOR_BIT, inputs.sh
     if sh is None:
         return
@@ -74,4 +77,15 @@ def _check(settings: Settings, inputs: Inputs) -> None:
             f"SH coefficients are {(*sh.shape[:1], count, *sh.shape[2:])}, {sh.dtype}, on {sh.device} at sh_degree "
             f"{degree}: expected ({n}, k, 3), torch.float32, on {device}, k of 1, 4, 9 or 16 and at least "
             "(degree + 1)^2, dc included"
+        )
+
+
+def _check_pixels(settings: Settings, options: Options) -> None:
+    """Refuse a background and weights that kernels would read out of bounds."""
+    if settings.bg.numel() != 3:
+        raise UserInputError(f"bg is {tuple(settings.bg.shape)}: expected (3,)")
+    weights, width, height = options.pixel_weights, int(settings.image_width), int(settings.image_height)
+    if weights is not None and weights.numel() != width * height:
+        raise UserInputError(
+            f"{weights.numel()} weights of pixels: expected {width * height}, for an image of {width}x{height}"
         )

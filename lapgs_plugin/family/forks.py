@@ -148,6 +148,8 @@ def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
     assert output.blending is not None
     assert inputs.scales is not None, "render_depth takes scales and rotations"
     assert inputs.quats is not None
+    if not len(inputs.means):
+        return _depths_of_nothing(output)
     (leaders,) = output.blending.leaders()
     rows, columns = (torch.arange(size, device=leaders.device) for size in (height, width))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
@@ -174,6 +176,21 @@ def _depths_of_leaders(settings: Any, inputs: Inputs) -> dict[str, Any]:
         "discriminants": torch.where(leaders >= 0, b * b - 4 * a * c, 0.0).reshape(shape),
         "gidx": at.int().reshape(shape),
         "accum_alpha": output.blending.transmittance.reshape(shape),
+    }
+
+
+def _depths_of_nothing(output: Output) -> dict[str, Any]:
+    """Return what `_depths_of_leaders` does, of a call without Gaussians."""
+    assert output.blending is not None
+    image, left = output.image, output.blending.transmittance[None]
+    none = torch.zeros_like(left)
+    return {
+        "render": image,
+        "out_pts": torch.zeros_like(image),
+        "rendered_depth": none,
+        "discriminants": none.clone(),
+        "gidx": none.int(),
+        "accum_alpha": left,
     }
 
 
@@ -461,15 +478,16 @@ def diff_rasterize(
         normalize(rotations), None,
     )  # fmt: skip
     output = rasterize(settings, inputs, Options(antialiasing=camera.proper_antialiasing))
+    image, radii = output.image, output.radii
 
-    def note(gradient: Tensor) -> None:
+    def note(gradient: Tensor) -> None:  # without the image, whose graph has the points and so this hook
         if len(densification_info):
-            densification_info[0] += output.radii > 0
+            densification_info[0] += radii > 0
             densification_info[1] += gradient[:, :2].norm(dim=1)
 
-    if points.requires_grad and output.image.requires_grad:
+    if points.requires_grad and image.requires_grad:
         points.register_hook(note)  # type: ignore[no-untyped-call]  # torch's
-    return output.image
+    return image
 
 
 @lru_cache(maxsize=64)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
 from lapgs_plugin.ops.photometric_loss import ssim_map, triton_works
-from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS
+from lapgs_plugin.ops.photometric_loss.in_torch import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_arguments
 
 __all__ = ["fused_ssim", "fused_ssim_", "fusedssim", "fusedssim_backward"]
 
@@ -29,6 +29,7 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     if first.shape[1] == 3 and triton_works(first, second):
         from lapgs_plugin.ops.photometric_loss.in_triton import photometric_loss_triton
 
+        check_arguments(first, second, 1.0)
         return 1 - photometric_loss_triton(first, second, 1.0)
     return ssim_map(first, second).mean()
 

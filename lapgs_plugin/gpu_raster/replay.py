@@ -192,7 +192,7 @@ class Frame:
         """Copy a background, unless it is the one of the view before."""
         before = self._copied_background
         if before is None or before[0]() is not background or before[1] != state_of(background):
-            self._background.copy_(background)
+            self._background.copy_(background.reshape(3))
             tracked = not background.is_inference()
             self._copied_background = (weakref.ref(background), state_of(background)) if tracked else None
 

@@ -41,7 +41,7 @@ LEAST_ROOM = 2**14
 MOST_PAIRS = 2**31 - 2**9
 """Most pairs whose places our kernels can number."""
 
-_rooms: dict[tuple[Any, ...], float] = {}  # by device, size and number of images; estimates
+_rooms: dict[tuple[Any, ...], float] = {}  # by device, size, and number of images or rules; estimates
 
 
 def blend_in_tiles(
@@ -170,7 +170,11 @@ class Pairs:
 
     def __init__(self, key: tuple[Any, ...], number: ArrivingNumber) -> None:
         self._key, self._number = key, number
-        self.room = _rounded(_rooms[key] if key in _rooms else MARGIN * self._number.read())
+        try:
+            self.room = _rounded(_rooms[key] if key in _rooms else MARGIN * self._number.read())
+        except DeviceMemoryError:
+            _rooms.pop(key, None)  # the next render may have fewer
+            raise
 
     def fit(self) -> bool:
         """Wait for their number, from which the next render has its room; return whether there was room for all."""

@@ -74,7 +74,7 @@ class TileGrid:
         middle = centres.mean(axis=0)
         flat = centres - middle
         flat = flat - np.outer(flat @ up, up)
-        across = np.linalg.svd(flat)[2][0]
+        across = np.linalg.svd(flat, full_matrices=False)[2][0]
         along = np.cross(up, across)
         along /= np.linalg.norm(along)
         shape = shape or _shape_for(len(cameras), float(np.std(flat @ across)), float(np.std(flat @ along)))

@@ -176,6 +176,19 @@ def test_gradient_scales_with_what_comes_back() -> None:
     torch.testing.assert_close(scaled, 3 * gradient)
 
 
+@pytest.mark.parametrize("views", [(), (2,)])
+def test_a_loss_is_differentiated_again_after_its_gradient_was_changed_in_place(views: tuple[int, ...]) -> None:
+    prediction, target = torch.rand(2, *views, 3, 20, 23, generator=torch.Generator().manual_seed(0))
+    prediction.requires_grad_()
+    loss = photometric_loss(prediction, target)
+    (expected,) = torch.autograd.grad(loss, prediction, retain_graph=True)
+    expected = expected.clone()
+    for times in (1, 2, 3):
+        loss.backward(retain_graph=True)  # type: ignore[no-untyped-call]  # torch's
+        assert prediction.grad is not None
+        torch.testing.assert_close(prediction.grad, times * expected)
+
+
 def test_images_need_not_be_contiguous() -> None:
     p, t = images((3, 20, 30))
     loss, gradient = loss_and_gradient(p, t, 0.2)
@@ -202,7 +215,7 @@ def test_nan_in_the_prediction_reaches_the_loss() -> None:
         (torch.zeros(3, 4, 5).half(), torch.zeros(3, 4, 5).half(), 0.2, "expected float32 or float64"),
         (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, requires_grad=True), 0.2, "pass target.detach()"),
         (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5), 1.5, "ssim_weight 1.5: expected a number from 0 to 1"),
-        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, device="meta"), 0.2, "target on meta: expected the CPU"),
+        (torch.zeros(3, 4, 5), torch.zeros(3, 4, 5, device="meta"), 0.2, "target on meta: expected one device"),
     ],
 )
 def test_refuses_what_it_cannot_compare(p: Tensor, t: Tensor, weight: float, message: str) -> None:
@@ -221,6 +234,9 @@ def test_the_same_is_refused_on_every_device(device: str) -> None:
         photometric_loss(p, p.clone().requires_grad_())
     with pytest.raises(UserInputError, match="ssim_weight nan: expected a number from 0 to 1"):
         photometric_loss(p, p, math.nan)
+    elsewhere = torch.zeros(3, 8, 8, device="cpu" if device == "meta" else "meta")
+    with pytest.raises(UserInputError, match=f"prediction on {device} and target on .*: expected one device"):
+        photometric_loss(p, elsewhere)
 
 
 def test_images_of_one_channel_are_not_for_the_kernels_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

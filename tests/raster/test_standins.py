@@ -396,6 +396,24 @@ def test_arguments_that_do_not_fit_are_refused() -> None:
         call(module, "graphdeco", case, activated(case) | {"shs": torch.zeros(3, 4, 3)})
     with pytest.raises(UserInputError, match="focal lengths"):
         call(module, "graphdeco", case, activated(case), tanfovx=0.1)
+    settings = settings_of(module, case.camera, case.background, 3)
+    for shape in ((3, 2), (2, 3), (9,)):
+        with pytest.raises(UserInputError, match=r"means2D is .* expected \(3, 3\) or \(3, 4\)"):
+            module.GaussianRasterizer(settings)(means2D=torch.zeros(shape), **activated(case))
+    with pytest.raises(UserInputError, match=r"bg is \(1,\).* expected \(3,\)"):
+        call(module, "graphdeco", case, activated(case), bg=torch.zeros(1))
+    marked = {"get_flag": True, "metric_map": torch.ones(7, dtype=torch.int32)}
+    with pytest.raises(UserInputError, match=r"7 weights of pixels.*53x41"):
+        call(module_of("fastgs"), "fastgs", case, activated(case), **marked)
+
+
+def test_a_background_may_be_a_row() -> None:
+    module, case = module_of("graphdeco"), case_of()
+    (image, *_), (expected, *_) = (
+        call(module, "graphdeco", case, activated(case), bg=torch.tensor(case.background).view(shape))
+        for shape in ((1, 3), (3,))
+    )
+    assert torch.equal(image, expected)
 
 
 def test_install_is_undone_and_refuses_to_replace() -> None:
@@ -446,6 +464,13 @@ def test_fused_ssim() -> None:
     assert (module.fused_ssim_(first, second) - values.mean(0)).abs().max() < 1e-5  # worst seen: 8.0e-7
     with pytest.raises(UserInputError, match="padding"):
         module.fused_ssim(first, second, padding="full")
+    for function in (module.fused_ssim, module.fused_ssim_):
+        for padding in ("same", "valid"):
+            with pytest.raises(UserInputError, match="images of one shape"):
+                function(first, second[:, :, :7], padding=padding)
+    binding = stand_ins("graphdeco-accel")["diff_gaussian_rasterization._C"]
+    with pytest.raises(UserInputError, match="images of one shape"):
+        binding.fusedssim(1e-4, 9e-4, first, second[:, :, :7])
 
 
 @pytest.mark.parametrize("padding", ["same", "valid"])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from contextlib import nullcontext
 from typing import Any
 
@@ -123,6 +125,24 @@ def test_mini_splatting_finds_points_where_rays_come_nearest() -> None:
     assert ((ray * to_centre).sum(1).abs() / to_centre.norm(dim=1))[seen].max() < 1e-3  # 1e-5 seen
     assert results["accum_alpha"].min() >= 0
     assert results["accum_alpha"].max() <= 1
+
+
+@pytest.mark.parametrize("variant", ["mini-splatting", "mini-splatting2"])
+def test_mini_splatting_finds_no_points_of_no_gaussians(variant: str) -> None:
+    case, module = case_of(n=0), module_of(variant)
+    rasterizer = module.GaussianRasterizer(settings_of(module, case.camera, (0.0, 0.0, 0.0), 3))
+    culling = {"culling": torch.zeros(0, dtype=torch.bool)} if variant == "mini-splatting2" else {}
+    results = rasterizer.render_depth(means2D=torch.zeros(0, 3), **activated(case), **culling)
+    whole = rasterizer.render_depth(
+        means2D=torch.zeros(40, 3),
+        **activated(small_case()),
+        **({"culling": torch.zeros(40, dtype=torch.bool)} if culling else {}),
+    )
+    assert {name: (value.shape, value.dtype) for name, value in results.items()} == {
+        name: (value.shape, value.dtype) for name, value in whole.items()
+    }
+    assert results.pop("accum_alpha").eq(1).all()
+    assert not any(value.any() for value in results.values())
 
 
 def test_absgs_returns_shares_and_absolute_gradients() -> None:
@@ -336,10 +356,9 @@ def test_relocated_copies_have_the_opacity_and_the_light_of_one(copies: int) -> 
         torch.testing.assert_close(light, (opacity[i].double() * torch.exp(-(x**2) / 2)).sum(), rtol=1e-5, atol=0)
 
 
-def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
-    case = small_case()
+def faster_gs_image(case: Case, info: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Return the image, and the leaves that it was made of."""
     module, field, camera = stand_ins("faster-gs")["FasterGSCudaBackend.torch_bindings"], case.field, case.camera
-    info = torch.zeros(2, 40)
     settings = module.RasterizerSettings(
         w2c=camera.world_to_camera, cam_position=camera.position, bg_color=torch.tensor(case.background),
         active_sh_bases=16, width=53, height=41, focal_x=camera.fx, focal_y=camera.fy, center_x=camera.cx,
@@ -354,8 +373,13 @@ def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
         field.sh[:, 1:],
     ]
     leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
-    image = module.diff_rasterize(*leaves, info, settings)
-    image.sum().backward()
+    return module.diff_rasterize(*leaves, info, settings), leaves
+
+
+def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
+    case, info = small_case(), torch.zeros(2, 40)
+    image, leaves = faster_gs_image(case, info)
+    image.sum().backward()  # type: ignore[no-untyped-call]  # torch's
     expected, radii, points = call(module_of("graphdeco"), "graphdeco", case, activated(case))
     expected.sum().backward(inputs=[points])
     assert relative(image, expected) < BOUND
@@ -363,3 +387,13 @@ def test_faster_gs_takes_raw_parameters_and_notes_screen_gradients() -> None:
     assert points.grad is not None
     assert relative(info[1], points.grad[:, :2].norm(dim=1)) < 1e-3  # worst seen: 5e-7
     assert all(leaf.grad is not None for leaf in leaves)
+
+
+def test_images_of_faster_gs_are_gone_when_nothing_has_them() -> None:
+    """A hook of the graph that has the image would keep both, where Python does not look for cycles."""
+    image, leaves = faster_gs_image(small_case(), torch.zeros(2, 40))
+    image.sum().backward()  # type: ignore[no-untyped-call]  # torch's
+    kept = [weakref.ref(image), weakref.ref(leaves[0])]
+    del image, leaves
+    gc.collect()
+    assert [one() for one in kept] == [None, None]

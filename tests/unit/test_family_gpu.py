@@ -381,11 +381,13 @@ for i in range(3):
 assert len(replay._frames._by_kind) == 4  # weights are added up elsewhere, in the frame of bare images
 # A background that changes, in place or not, and views without gradients.
 settings = settings_of(whole, DEVICE)
-for name in ("first", "again", "in place", "another", "inference", "after inference"):
+for name in ("first", "again", "in place", "row", "another", "inference", "after inference"):
     if name == "in place":
         settings.bg.mul_(0.5)
+    if name == "row":
+        settings.bg = settings.bg[None].mul(0.5)
     if name == "another":
-        settings.bg = settings.bg.flip(0)
+        settings.bg = settings.bg[0].flip(0)
     if name == "inference":
         with torch.inference_mode():
             settings.bg = settings.bg + 0.25

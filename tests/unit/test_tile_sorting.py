@@ -170,6 +170,15 @@ def test_more_pairs_than_can_be_numbered_are_refused(rooms: Rooms, monkeypatch: 
     assert rooms.blended == 0
 
 
+def test_an_image_of_too_many_pairs_does_not_forbid_the_next_one(rooms: Rooms, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "MOST_PAIRS", 20)
+    expected = image_and_gradient(3)
+    with pytest.raises(DeviceMemoryError, match="20 at most"):
+        image_and_gradient(60)
+    for one, other in zip(image_and_gradient(3), expected, strict=True):
+        assert torch.equal(one, other)
+
+
 def test_gsplats_sorting_is_used_only_if_nothing_has_to_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     bindings.compiled_functions.cache_clear()
     monkeypatch.setattr(bindings, "gsplat_built", lambda: None)

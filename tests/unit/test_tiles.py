@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,6 +76,15 @@ def test_columns_follow_the_longer_side() -> None:
     assert left.max() < right.min() + 0.5 or right.max() < left.min() + 0.5  # the axis is not exactly x
 
 
+def test_points_far_from_the_cameras_share_out_nothing() -> None:
+    scene = street()
+    far = torch.randn(2 * len(scene.points), 3, generator=torch.Generator().manual_seed(0))
+    grid = TileGrid.of(replace(scene, points=torch.cat([scene.points, 1e4 + far])), (2, 3))
+    assert grid == TileGrid.of(scene, (2, 3))
+    alone = TileGrid.of(replace(scene, points=1e4 + far), (2, 3))  # as no others are near
+    assert {int(alone.contains(tile, 1e4 + far).sum()) for tile in alone} <= {len(far) // 6, len(far) // 6 + 1}
+
+
 def test_height_divides_nothing() -> None:
     points = street().points
     grid = TileGrid.of(street(), (2, 2))
@@ -88,6 +98,17 @@ def test_auto_makes_tiles_by_the_views(views: int, count: int) -> None:
     rows, columns = TileGrid.of(street(views), None).shape
     assert rows * columns >= count
     assert rows * (columns - 1) < count
+
+
+def test_memory_does_not_grow_with_the_square_of_the_views() -> None:
+    scene = street(1700)
+    tracemalloc.start()
+    try:
+        TileGrid.of(scene, (2, 2))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 * len(scene.train) ** 2 / 4  # bytes; 1e6 seen
 
 
 def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -108,6 +129,13 @@ def test_a_tile_behind_another_is_not_seen() -> None:
     seen = views_of_tile(cameras, field, inside, CpuRasterizer(), torch.device("cpu"))
     assert set(seen.masks) == {"open.png"}
     assert seen.seen.tolist() == [*[False] * len(wall), True, False]
+
+
+@pytest.mark.parametrize(("opacity", "seen"), [(0.015, False), (0.05, True)])
+def test_what_the_base_hardly_shows_is_not_seen(opacity: float, seen: bool) -> None:
+    field = replace(blobs([(0.0, 0.0, 4.0)], 0.5), opacity_logits=torch.tensor([opacity]).logit())
+    cameras, inside = {"a.png": _camera(torch.zeros(3))}, torch.tensor([True])
+    assert bool(views_of_tile(cameras, field, inside, CpuRasterizer(), torch.device("cpu")).masks) == seen
 
 
 def test_masks_are_where_a_tile_is() -> None:

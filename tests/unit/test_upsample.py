@@ -71,6 +71,11 @@ def test_images_of_other_channels_are_refused_and_not_read_out_of_bounds(shape: 
         upsample_add(Pyramid(), torch.zeros(shape), torch.zeros(3, 4, 6))
 
 
+def test_images_on_two_devices_are_refused() -> None:
+    with pytest.raises(UserInputError, match="on cpu and meta: expected images on one device"):
+        upsample_add(Pyramid(), torch.zeros(3, 5, 5), torch.zeros(3, 10, 10, device="meta"))
+
+
 def test_gradients_go_through() -> None:
     coarse, fine, _ = images("camera", (3, 8, 9), torch.float32)
     coarse.requires_grad_()

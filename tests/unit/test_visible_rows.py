@@ -355,6 +355,13 @@ PACKAGE = 'package = render(view)\nimage, shown = package["image"], package["vis
         ("show(render(view))\n", STATISTICS, False),
         ("show(render(view)['visibility_filter'])\n", STATISTICS, False),
         ("module.render(view).values()\n", STATISTICS, False),
+        ("draw = render if fast else module.other\nshow(draw(view)['visibility_filter'])\n", STATISTICS, False),
+        ("draw = module.render\nshow(draw(view)['visibility_filter'])\n", STATISTICS, False),
+        ("show(partial(render, view)()['visibility_filter'])\n", STATISTICS, False),
+        ("show(functools.partial(render, view)()['visibility_filter'])\n", STATISTICS, False),
+        ("for other in map(render, views): show(other['visibility_filter'])\n", STATISTICS, False),
+        ("training_report(model, render, (view,))\n", STATISTICS, True),  # its renders are not this function's
+        ("training_report(model, view, by=render)\n", STATISTICS, True),
     ],
 )
 def test_where_masks_take_the_places_of_indices(lines: str, statistics: str, expected: bool) -> None:

@@ -36,8 +36,8 @@ def photometric_loss(
         sizes: (width, height) of several views, each in the top left of its image; None if they are whole.
 
     Raises:
-        UserInputError: the images differ in shape, their channels come last, the target requires a gradient, the
-            weight leaves [0, 1], or the prediction is on a CPU and neither float32 nor float64.
+        UserInputError: the images differ in shape or device, their channels come last, the target requires a gradient,
+            the weight leaves [0, 1], or the prediction is on a CPU and neither float32 nor float64.
     """
     check_arguments(prediction, target, ssim_weight)
     if prediction.shape[-3] == 3 and triton_works(prediction):
@@ -77,7 +77,11 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     """Return SSIM of each pixel and channel of float32 images (b, c, h, w), differentiable by the prediction.
 
     The window is an 11x11 Gaussian of sigma 1.5, with zeros outside of the images.
+
+    Raises:
+        UserInputError: as `photometric_loss`; the target may require a gradient, and gets none.
     """
+    check_arguments(prediction, target.detach(), 1.0)
     if prediction.shape[1] == 3 and triton_works(prediction, target):
         from lapgs_plugin.ops.photometric_loss.in_triton import ssim_map_triton
 

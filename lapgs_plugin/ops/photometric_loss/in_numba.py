@@ -236,16 +236,18 @@ def _blocks(channels: int, height: int, width: int) -> tuple[Integers, int]:
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        images = [image.detach().contiguous().numpy() for image in (prediction, target)]
+        # SSIM is computed channel by channel: several images are one of more channels.
+        images = [image.detach().flatten(0, -3).contiguous().numpy() for image in (prediction, target)]
         count = prediction.numel()
-        gradient = empty(count, images[0].dtype).reshape(prediction.shape)
-        blocks, pitch = _blocks(*prediction.shape)
+        gradient = empty(count, images[0].dtype).reshape(images[0].shape)
+        blocks, pitch = _blocks(*images[0].shape)
         sums = np.empty((len(blocks), 2))
         # The weight of SSIM has the factor 2 that the stored derivatives lack.
         weights = (1 - ssim_weight) / count, -2 * ssim_weight / count
         parallel(_photometric_kernel, blocks, pitch, *images, weights, gradient, sums)
         l1, ssim = sums.sum(axis=0) / count
-        ctx.save_for_backward(torch.from_numpy(gradient))
+        # In the shape that is returned: a view would be a leaf's gradient, which may be changed in place.
+        ctx.save_for_backward(torch.from_numpy(gradient).view(prediction.shape))
         return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
 
     @staticmethod
@@ -268,7 +270,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
         A scalar of the images' type, the same bits for any number of threads.
 
     Raises:
-        UserInputError: as `check_arguments`; or an image is on a GPU, or of another type than the other.
+        UserInputError: as `check_arguments`; or images are on a GPU, or one is of another type than the other.
     """
     check_arguments(prediction, target, ssim_weight)
     if prediction.dtype != target.dtype or prediction.dtype not in (torch.float32, torch.float64):
@@ -276,11 +278,7 @@ def photometric_loss_cpu(prediction: Tensor, target: Tensor, ssim_weight: float 
             f"prediction of {prediction.dtype} and target of {target.dtype}: expected float32 or float64 for both; "
             "convert one with .to(dtype)"
         )
-    if prediction.device.type != "cpu" or target.device.type != "cpu":
-        raise UserInputError(
-            f"prediction on {prediction.device} and target on {target.device}: expected the CPU; move them with .cpu()"
-        )
-    # SSIM is computed channel by channel: several images are one of more channels.
-    planes = prediction.flatten(0, -3), target.flatten(0, -3)
-    loss: Tensor = _PhotometricLoss.apply(*planes, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
+    if prediction.device.type != "cpu":
+        raise UserInputError(f"images on {prediction.device}: expected the CPU; move them with .cpu()")
+    loss: Tensor = _PhotometricLoss.apply(prediction, target, ssim_weight)  # type: ignore[no-untyped-call]  # torch's
     return loss

@@ -53,13 +53,18 @@ def check_arguments(prediction: Tensor, target: Tensor, ssim_weight: float) -> N
     """Check the arguments of `photometric_loss`, on any device.
 
     Raises:
-        UserInputError: the images differ in shape, their channels come last, the target requires a gradient, or the
-            weight leaves [0, 1].
+        UserInputError: the images differ in shape or device, their channels come last, the target requires a gradient,
+            or the weight leaves [0, 1].
     """
     if prediction.ndim not in (3, 4) or prediction.shape != target.shape or prediction.numel() == 0:
         raise UserInputError(
             f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}: expected two images of one shape "
             "(channels, height, width); resize the target to the level that is rendered"
+        )
+    if prediction.device != target.device:
+        raise UserInputError(
+            f"prediction on {prediction.device} and target on {target.device}: expected one device; move one with "
+            ".to(device)"
         )
     if prediction.shape[-1] <= 4 < prediction.shape[-3]:
         raise UserInputError(

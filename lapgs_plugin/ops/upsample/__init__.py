@@ -31,12 +31,14 @@ def upsample_add(
         sizes: (width, height) of several fine images, each in the top left of its own; None if they are whole.
 
     Raises:
-        UserInputError: `coarse` is not half of `fine`, or has other channels.
+        UserInputError: `coarse` is not half of `fine`, has other channels, or is on another device.
     """
     size = fine.shape[-2], fine.shape[-1]
     require_half(coarse, size)
     if coarse.shape[:-2] != fine.shape[:-2]:
         raise UserInputError(f"{tuple(coarse.shape)} and {tuple(fine.shape)}: expected images of as many channels")
+    if coarse.device != fine.device:
+        raise UserInputError(f"images on {coarse.device} and {fine.device}: expected images on one device")
     if triton_works(fine):
         from lapgs_plugin.ops.upsample.in_triton import upsample_add_triton
 
