@@ -288,6 +288,13 @@ class StageRun:
         self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
         self._count_all()
 
+    def leave_finished_fields(self) -> None:
+        """Go back to the finished fields as they are archived, which the stage then leaves as they are."""
+        archived = joint_fields(self.prepared, self.poses, None)
+        self.joint = None
+        self.images.predictions = self.images.held_out = archived.predictions(self.prepared.pyramid)
+        self._count_all()
+
     @property
     def _models(self) -> list[TrainableField]:
         """The fields under training."""
