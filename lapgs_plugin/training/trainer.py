@@ -110,7 +110,7 @@ class Trainer:
                     stage = self.prepared.plan[level]
                     if stage.level in archive.available_levels and prepared.record_to_extend(stage) is None:
                         continue
-                    here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
+                    here = checkpoint if checkpoint is not None and checkpoint.get("level") == stage.level else None
                     self._run_stage(stage, here, stop)
             except torch.cuda.OutOfMemoryError as error:
                 raise self._out_of_memory() from error
@@ -353,7 +353,10 @@ class Trainer:
         )
 
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:
-        """Check a checkpoint against the stage, and continue from it."""
+        """Check a checkpoint against the stage, and continue from it. The checkpoint is empty afterwards.
+
+        The stage has copies of its tensors, and callers would keep the originals in memory to the end of the run.
+        """
         path = self.prepared.archive.path(CHECKPOINT)
         count = len(checkpoint["model"]["params"]["means"])
         check_densifier(checkpoint["densifier"], run.densifier.state, count, path)
@@ -363,6 +366,7 @@ class Trainer:
             if (best := checkpoint.get("best")) is not None:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
+        checkpoint.clear()
 
     def _archive_stage(self, run: StageRun, extends: bool) -> None:
         """Archive a finished stage, or the longer training of one that was finished before."""
