@@ -151,7 +151,7 @@ def test_a_level_that_becomes_shorter_is_pruned_although_its_densification_is_ov
         assert record.decided is not None
         until = record.iterations / 2
         assert until < record.decided.after < MOST / 2, "no densification ends at an iteration of the stage"
-    after = record.decided.after
+        after = record.decided.after
     assert counts[0.0][after - 1] == counts[0.05][after - 1]
     assert 0.05 < 1 - counts[0.05][after] / counts[0.0][after] < 0.5
 
