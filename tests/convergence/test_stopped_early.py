@@ -138,6 +138,18 @@ def test_a_stopped_run_decides_alike(whole: Any, scene: Scene, tmp_path: Path, l
     assert plys(parts) == plys(archive)
 
 
+def test_statistics_of_density_control_go_on_when_a_level_becomes_shorter(scene: Scene, tmp_path: Path) -> None:
+    settings = replace(of_kind("one field"), refine_poses=False)
+    decided = train(tmp_path / "whole", scene, settings).manifest.record(0).decided
+    assert decided is not None
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "parts", scene, settings, user_hooks=[Stops(0, decided.after)])
+    checkpoint = RunArchive.open(tmp_path / "parts").load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["gains"]["decided"] == checkpoint["counts"]["iteration"] == decided.after
+    assert checkpoint["densifier"]["count"].max() > 10  # views that showed a Gaussian
+
+
 def test_a_level_that_becomes_shorter_is_pruned_although_its_densification_is_over_by_then(
     scene: Scene, tmp_path: Path
 ) -> None:

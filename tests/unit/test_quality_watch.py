@@ -143,13 +143,14 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     assert len(aside) == 2
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
+    colors: dict[tuple[int, int], Any] = {}
 
     def invented(evaluation: StageEvaluation, view: View, exposure: Tensor | None) -> ViewPsnr:
         run = evaluation.run
         assert view.name in aside
         assert run.appearance is not None
         moment = run.stage.level, run.counts.iteration
-        fields[moment] = run.model.field.means.detach().clone()
+        fields[moment], colors[moment] = run.model.field.means.detach().clone(), run.appearance.archived()
         if run.joint is not None:
             along[moment] = run.joint.fields[1].means.clone()
         return ViewPsnr(0.0, 20.0 + (moment in {(1, 16), (0, 36)}), None)
@@ -163,6 +164,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     assert sum("1.00 dB better than the last one on 2 training views" in line for line in monitor.lines) == 2
     exposure = whole.exposure(0)
     assert exposure is not None
+    assert exposure == colors[0, 36] != colors[0, 40]
     assert set(exposure) == names.seen
     for level, iteration in ((1, 20), (0, 38)):
         folder = tmp_path / f"stopped_{level}"
