@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
-from tests.training_runs import Said, StopAt, resume, train
+from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
 
@@ -173,6 +174,24 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
         again = resume(folder, scene, settings)
         assert [(again.field(each).means == whole.field(each).means).all() for each in (1, 0)] == [True, True]
         assert again.exposure(0) == exposure
+
+
+def test_an_extension_that_gains_nothing_leaves_the_fields_of_the_finished_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = ring_scene(train=12, test=0)
+    settings = TrainSettings(iterations=40, sh_degree=0, keep="best", appearance="none", joint=0.5)
+    monkeypatch.setattr(
+        StageEvaluation, "_psnr", lambda evaluation, *_: measured(20.0 + evaluation.run.counts.iteration)
+    )
+    finished = plys(train(tmp_path / "run", scene, settings))
+    monkeypatch.setattr(
+        StageEvaluation, "_psnr", lambda evaluation, *_: measured(40.0 - evaluation.run.counts.iteration)
+    )
+    longer = replace(settings, iterations=60, extended=20)
+    archive = resume(tmp_path / "run", scene, longer)
+    assert archive.manifest.record(0).iterations == 40
+    assert plys(archive) == finished
 
 
 def test_few_views_for_many_iterations_are_named() -> None:
