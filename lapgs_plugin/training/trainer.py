@@ -127,8 +127,9 @@ class Trainer:
         if prepared.began is not None:
             require_time_left(text, now - prepared.began)
             return prepared.began + parse_duration(text)
-        if checkpoint is not None and checkpoint["budget"] is not None:
-            return now + float(checkpoint["budget"]["run_seconds"])
+        if checkpoint is not None:
+            budget = checkpoint["budget"]  # None where the run has got its time since, of which nothing is over
+            return now + (parse_duration(text) if budget is None else float(budget["run_seconds"]))
         records = prepared.archive.manifest.records
         spent = sum(record.train_seconds + sum(record.overhead_seconds.values()) for record in records)
         return now + parse_duration(text) - spent

@@ -79,6 +79,18 @@ def test_a_stopped_run_keeps_what_the_clock_decided(
     assert plys(archive) == plys(whole)
 
 
+def test_a_run_killed_before_it_saved_anything_of_its_time_has_all_of_it(scene: Scene, tmp_path: Path) -> None:
+    """The seconds of its base were over before it got a time."""
+    planned = replace(TIMED, time=None)
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, planned, monitor=StopAt(0, 20))
+    base = RunArchive.open(tmp_path / "run").manifest.record(1)
+    seconds = base.train_seconds + sum(base.overhead_seconds.values())
+    time = f"{min(0.5, seconds / 2):.3f}s"
+    archive = resume(tmp_path / "run", scene, replace(planned, time=time), **timed())
+    assert archive.manifest.record(0).iterations == pytest.approx(20 + 100 * float(time[:-1]), rel=0.2)
+
+
 def test_divergence_is_named_where_the_clock_ends_a_level_at_once(scene: Scene, tmp_path: Path) -> None:
     class Steep(Ticks):
         def loss(self, context: StageContext, image: torch.Tensor) -> torch.Tensor | None:
