@@ -68,7 +68,6 @@ class TrainRequest:
         overwrite: replace the run in `out`.
         chosen: options that the user chose, by parameter name. A run that is continued must have been started with the
             same. A new run on few photos gets fewer iterations if they are not among them.
-
         began: when the seconds of --time began, by `time.monotonic`.
         ranks: the processes that train it; all make the same request.
         shard: divide the Gaussians over them.

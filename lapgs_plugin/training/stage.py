@@ -209,9 +209,9 @@ class StageRun:
         """
         assert self.gains is not None
         self.gains.note(self.counts.iteration, psnrs)
-        self._last(self.gains.planned)
         if self.gains.decided is not None:
             self._train_on(self._trained_views())
+        self._last(self.gains.planned)
 
     @property
     def withholds(self) -> bool:
