@@ -227,7 +227,8 @@ class Trainer:
         with record.overhead.timed("pyramid"):
             images = photos_of(prepared, stage)
         with closing(images):
-            if stage.signed:
+            jointly = checkpoint is not None and checkpoint.get("joint") is not None
+            if stage.signed and not jointly:  # else rendered
                 predict_views(prepared, stage, images, record.overhead)
             run = self._stage_run(stage, schedule, model, images, record, checkpoint, budget, gains)
             evaluation = StageEvaluation(run, self._quality, self.monitor)

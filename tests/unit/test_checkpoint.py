@@ -342,3 +342,13 @@ def test_a_continued_stage_does_not_hold_its_checkpoint_in_memory(
     assert len(loaded) >= 10
     assert held
     assert not any(held)
+
+
+def test_predictions_that_joint_training_renders_are_not_cached_when_it_continues(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, SETTINGS, monitor=StopInTheEnd(0))
+    checkpoint = RunArchive.open(tmp_path / "run").load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["joint"] is not None
+    record = resume(tmp_path / "run", scene, SETTINGS).manifest.record(0)
+    assert record.overhead_seconds["cache"] == checkpoint["overhead"]["cache"] > 0.0
