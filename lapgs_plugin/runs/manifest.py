@@ -129,7 +129,7 @@ class LevelRecord:
     Attributes:
         level: pyramid level, 0 is full resolution.
         signed: whether its field is a residual.
-        iterations: optimizer steps it was trained for.
+        iterations: it was trained for, one for each view; a step may take several.
         num_gaussians: Gaussians in its PLY.
         peak_gaussians: most Gaussians at any moment of its training.
         train_seconds: iterative optimization alone.

@@ -189,8 +189,9 @@ class StageEvaluation:
         if best is None or best["iteration"] == run.stage.iterations:
             return
         run.model = run.prepared.restored_model(best["model"])
-        run.joint = None
         if best["joint"] is not None:
             run.train_jointly(best["joint"])
+        elif run.joint is not None:
+            run.leave_finished_fields()
         run.restore_transforms(best)
         self._last = None

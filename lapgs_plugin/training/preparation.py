@@ -68,7 +68,6 @@ class TrainRequest:
         overwrite: replace the run in `out`.
         chosen: options that the user chose, by parameter name. A run that is continued must have been started with the
             same. A new run on few photos gets fewer iterations if they are not among them.
-
         began: when the seconds of --time began, by `time.monotonic`.
         ranks: the processes that train it; all make the same request.
         shard: divide the Gaussians over them.
@@ -161,6 +160,8 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
     def decide(size: tuple[int, int], photos: int) -> None:
         nonlocal settings
         _require_views(ranks, photos)
+        if (asked := settings.asked_views) is not None and not request.shard:
+            _require_view_of_each(ranks, asked)
         if "iterations" not in request.chosen and (fewer := settings.for_photos(photos)) != settings:
             settings = fewer
             most = "at most " if settings.stops_early else ""
@@ -316,12 +317,7 @@ def _ready(run: PreparedRun) -> PreparedRun:
     ranks = run.ranks
     if ranks.size == 1:
         return run
-    fewest = min(run.schedule_of(stage).views for stage in run.plan)
-    if ranks.size > fewest:
-        raise UserInputError(
-            f"{ranks.together}: a step of this run has {counted(fewest, 'view')}, fewer than ranks; give at most so "
-            "many ranks, or more --views-per-step"
-        )
+    _require_view_of_each(ranks, min(run.schedule_of(stage).views for stage in run.plan))
     if run.settings.images_on == "disk":
         return run
     held = held_views(run.owned((*run.scene.train, *run.aside, *run.scene.test)), progress=ranks.leads)
@@ -372,6 +368,15 @@ def _require_views(ranks: Ranks, photos: int) -> None:
     """Refuse more ranks than training photos."""
     if ranks.size > photos:
         raise UserInputError(f"{ranks.together}: the scene has {photos} training photos; give at most so many ranks")
+
+
+def _require_view_of_each(ranks: Ranks, views: int) -> None:
+    """Refuse more ranks than the views of a step."""
+    if ranks.size > views:
+        raise UserInputError(
+            f"{ranks.together}: a step of this run has {counted(views, 'view')}, fewer than ranks; give at most so "
+            "many ranks, or more --views-per-step"
+        )
 
 
 def _require_one_process(ranks: Ranks, settings: TrainSettings) -> None:

@@ -196,6 +196,10 @@ class StageRun:
         ranks, ended = self.prepared.ranks, self.counts.iteration >= self.stage.iterations
         if self.budget is not None and (ended or self._late_steps % ranks.steps_a_decision == 0):
             self._last(ranks.from_leader(self.budget.length(self.counts.iteration)))
+            if (
+                not ended and self.counts.iteration == self.stage.iterations
+            ):  # `_step` did not know that it was the last
+                self.require_finite(self.counts.iteration)
 
     def note_gains(self, psnrs: Sequence[float]) -> None:
         """Let the stage have the iterations that views set aside gain by.
@@ -205,9 +209,9 @@ class StageRun:
         """
         assert self.gains is not None
         self.gains.note(self.counts.iteration, psnrs)
-        self._last(self.gains.planned)
         if self.gains.decided is not None:
             self._train_on(self._trained_views())
+        self._last(self.gains.planned)
 
     @property
     def withholds(self) -> bool:
@@ -232,7 +236,7 @@ class StageRun:
         self.prepared = self.prepared.lasting(self.stage.level, iterations)
         self.stage = self.record.stage = self.prepared.plan[self.stage.level]
         self.record.iterations = self.prepared.plan.iterations
-        self.schedule = self.prepared.schedule_of(self.stage)
+        planned_before, self.schedule = self.schedule, self.prepared.schedule_of(self.stage)
         statistics = self.densifier.state
         self.densifier = self.prepared.density_control(self.stage, self.schedule)
         self.densifier.state = statistics
@@ -241,6 +245,17 @@ class StageRun:
         self._planner = replace(self._planner, schedule=self.schedule, joint_from=joint_from)
         for learned in filter(None, self.transforms.values()):
             learned.total = self.prepared.plan.iterations
+        if self._skips_pruning(planned_before):
+            self.record.resume_clock()
+            self._prune()
+            self.record.pause_clock()
+
+    def _skips_pruning(self, before: StageSchedule) -> bool:
+        """Return whether pruning, still to come by the schedule before, is over by the one that is followed now."""
+        due, was_due = self.schedule.prunes_after, before.prunes_after
+        if not self._settings.prune or due is None or was_due is None:
+            return False
+        return due <= self.counts.iteration < was_due
 
     def _profile(self) -> None:
         """Start or end a profile if it is due, outside the timed region."""
@@ -286,6 +301,13 @@ class StageRun:
         self.images.drop_predictions()
         self.joint = joint_fields(self.prepared, self.poses, states)
         self.images.predictions = self.images.held_out = self.joint.predictions(self.prepared.pyramid)
+        self._count_all()
+
+    def leave_finished_fields(self) -> None:
+        """Go back to the finished fields as they are archived, which the stage then leaves as they are."""
+        archived = joint_fields(self.prepared, self.poses, None)
+        self.joint = None
+        self.images.predictions = self.images.held_out = archived.predictions(self.prepared.pyramid)
         self._count_all()
 
     @property
@@ -527,15 +549,20 @@ class StageRun:
             degree = self.schedule.active_sh_degree(iteration)
             scores = self._scoring.scores(self.model.field.detach(), iteration, degree, threshold)
         changed = self.densifier.after_step(self.model, iteration, result, camera, scores)
-        if (share := self._settings.prune) and iteration == self.schedule.prunes_after:
-            gone = self._scoring.least_visible(self.model.field.detach(), share)
-            remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
+        if self._settings.prune and iteration == self.schedule.prunes_after:
+            self._prune()
             changed = True
-        if changed:
+        elif changed:
             self._count_all()
         if changed and context is not None:
             self.hooks.on_densify(context)
         self.counts.peak_gaussians = max(self.counts.peak_gaussians, self.num_optimized)
+
+    def _prune(self) -> None:
+        """Remove the least visible Gaussians."""
+        gone = self._scoring.least_visible(self.model.field.detach(), self._settings.prune)
+        remove(self.model.params, self.model.optimizers, self.densifier.state, gone)
+        self._count_all()
 
     def _note_loss(self, loss: float, iteration: int, views: int) -> None:
         """Add the mean loss of some views to the smoothed loss; `iteration` is that of the last view."""

@@ -110,7 +110,7 @@ class Trainer:
                     stage = self.prepared.plan[level]
                     if stage.level in archive.available_levels and prepared.record_to_extend(stage) is None:
                         continue
-                    here = checkpoint if checkpoint is not None and checkpoint["level"] == stage.level else None
+                    here = checkpoint if checkpoint is not None and checkpoint.get("level") == stage.level else None
                     self._run_stage(stage, here, stop)
             except torch.cuda.OutOfMemoryError as error:
                 raise self._out_of_memory() from error
@@ -127,8 +127,9 @@ class Trainer:
         if prepared.began is not None:
             require_time_left(text, now - prepared.began)
             return prepared.began + parse_duration(text)
-        if checkpoint is not None and checkpoint["budget"] is not None:
-            return now + float(checkpoint["budget"]["run_seconds"])
+        if checkpoint is not None:
+            budget = checkpoint["budget"]  # None where the run has got its time since, of which nothing is over
+            return now + (parse_duration(text) if budget is None else float(budget["run_seconds"]))
         records = prepared.archive.manifest.records
         spent = sum(record.train_seconds + sum(record.overhead_seconds.values()) for record in records)
         return now + parse_duration(text) - spent
@@ -226,7 +227,8 @@ class Trainer:
         with record.overhead.timed("pyramid"):
             images = photos_of(prepared, stage)
         with closing(images):
-            if stage.signed:
+            jointly = checkpoint is not None and checkpoint.get("joint") is not None
+            if stage.signed and not jointly:  # else rendered
                 predict_views(prepared, stage, images, record.overhead)
             run = self._stage_run(stage, schedule, model, images, record, checkpoint, budget, gains)
             evaluation = StageEvaluation(run, self._quality, self.monitor)
@@ -353,7 +355,10 @@ class Trainer:
         )
 
     def _restore(self, run: StageRun, checkpoint: dict[str, Any]) -> None:
-        """Check a checkpoint against the stage, and continue from it."""
+        """Check a checkpoint against the stage, and continue from it. The checkpoint is empty afterwards.
+
+        The stage has copies of its tensors, and callers would keep the originals in memory to the end of the run.
+        """
         path = self.prepared.archive.path(CHECKPOINT)
         count = len(checkpoint["model"]["params"]["means"])
         check_densifier(checkpoint["densifier"], run.densifier.state, count, path)
@@ -363,6 +368,7 @@ class Trainer:
             if (best := checkpoint.get("best")) is not None:
                 check_transforms(best.get(name), shape, f"best.{name}", path)
         run.restore(checkpoint)
+        checkpoint.clear()
 
     def _archive_stage(self, run: StageRun, extends: bool) -> None:
         """Archive a finished stage, or the longer training of one that was finished before."""

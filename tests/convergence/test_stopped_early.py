@@ -19,7 +19,7 @@ from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import gains
 from lapgs_plugin.training.preparation import TrainRequest
 from lapgs_plugin.training.quality import set_aside_to_stop
-from lapgs_plugin.training.settings import TrainSettings
+from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.training_runs import Said, plys, resume, train
 from tests.training_scene import ring_scene
 
@@ -136,6 +136,36 @@ def test_a_stopped_run_decides_alike(whole: Any, scene: Scene, tmp_path: Path, l
     parts = resume(tmp_path / "parts", scene, of_kind(kind), user_hooks=[Trained()])
     assert [r.decided for r in parts.manifest.records] == [r.decided for r in archive.manifest.records]
     assert plys(parts) == plys(archive)
+
+
+def test_statistics_of_density_control_go_on_when_a_level_becomes_shorter(scene: Scene, tmp_path: Path) -> None:
+    settings = replace(of_kind("one field"), refine_poses=False)
+    decided = train(tmp_path / "whole", scene, settings).manifest.record(0).decided
+    assert decided is not None
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "parts", scene, settings, user_hooks=[Stops(0, decided.after)])
+    checkpoint = RunArchive.open(tmp_path / "parts").load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["gains"]["decided"] == checkpoint["counts"]["iteration"] == decided.after
+    assert checkpoint["densifier"]["count"].max() > 10  # views that showed a Gaussian
+
+
+def test_a_level_that_becomes_shorter_is_pruned_although_its_densification_is_over_by_then(
+    scene: Scene, tmp_path: Path
+) -> None:
+    densification = Densification(strategy="3dgs", start=2)
+    settings = replace(of_kind("one field"), refine_poses=False, densification=densification)
+    counts = {}
+    for share in (0.0, 0.05):
+        archive = train(tmp_path / str(share), scene, replace(settings, prune=share), test_every=1)
+        record = archive.manifest.record(0)
+        counts[share] = {entry["iteration"]: entry["num_gaussians"] for entry in archive.history()}
+        assert record.decided is not None
+        until = record.iterations / 2
+        assert until < record.decided.after < MOST / 2, "no densification ends at an iteration of the stage"
+        after = record.decided.after
+    assert counts[0.0][after - 1] == counts[0.05][after - 1]
+    assert 0.05 < 1 - counts[0.05][after] / counts[0.0][after] < 0.5
 
 
 def test_a_damaged_decision_is_one_line(scene: Scene, tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from lapgs_plugin.errors import TrainingStoppedError
+from lapgs_plugin.errors import TrainingDivergedError, TrainingStoppedError
 from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.scene import Scene
@@ -76,3 +77,29 @@ def test_a_stopped_run_keeps_what_the_clock_decided(
     lengths = [record.iterations for record in archive.manifest.records]
     assert lengths == [record.iterations for record in whole.manifest.records]
     assert plys(archive) == plys(whole)
+
+
+def test_a_run_killed_before_it_saved_anything_of_its_time_has_all_of_it(scene: Scene, tmp_path: Path) -> None:
+    """The seconds of its base were over before it got a time."""
+    planned = replace(TIMED, time=None)
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, planned, monitor=StopAt(0, 20))
+    base = RunArchive.open(tmp_path / "run").manifest.record(1)
+    seconds = base.train_seconds + sum(base.overhead_seconds.values())
+    time = f"{min(0.5, seconds / 2):.3f}s"
+    archive = resume(tmp_path / "run", scene, replace(planned, time=time), **timed())
+    assert archive.manifest.record(0).iterations == pytest.approx(20 + 100 * float(time[:-1]), rel=0.2)
+
+
+def test_divergence_is_named_where_the_clock_ends_a_level_at_once(scene: Scene, tmp_path: Path) -> None:
+    class Steep(Ticks):
+        def loss(self, context: StageContext, image: torch.Tensor) -> torch.Tensor | None:
+            if context.iteration != 40:
+                return None
+            self.seconds += 60.0
+            return (0.0 * image.mean()).sqrt()  # 0, with a gradient of infinity times 0
+
+    ticks = Steep()
+    settings = TrainSettings(iterations=400, levels=1, time="6s", sh_degree=0, appearance="none")
+    with pytest.raises(TrainingDivergedError, match=r"level 0, iteration 40: .*NaN"):
+        train(tmp_path / "run", scene, settings, clock=ticks, user_hooks=[ticks])

@@ -27,6 +27,7 @@ from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import CHECKPOINT
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.joint import JointFields
+from lapgs_plugin.training.monitor import Monitor, Tick
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from tests.folders import files_in
@@ -102,6 +103,24 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
     assert plys(archive) == plys(whole)
     places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
     assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
+
+
+def test_history_after_the_checkpoint_of_a_killed_run_is_not_kept_twice(
+    scene: Scene, tmp_path: Path, whole: RunArchive
+) -> None:
+    class Kill(Monitor):
+        def tick(self, stage: Stage, tick: Tick) -> None:
+            if (tick.level, tick.iteration) == (0, 17):
+                raise Killed
+
+    settings = settings_from_manifest(whole.manifest)
+    with pytest.raises(Killed):
+        train(tmp_path / "parts", scene, settings, monitor=Kill(), checkpoint_every=10)
+    assert RunArchive.open(tmp_path / "parts").history()[-1]["iteration"] == 17
+    archive = resume(tmp_path / "parts", scene, settings)
+    places = [(entry["level"], entry["iteration"], entry["loss"]) for entry in archive.history()]
+    assert places == [(entry["level"], entry["iteration"], entry["loss"]) for entry in whole.history()]
+    assert plys(archive) == plys(whole)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pickle
 import signal
 import time
 import tracemalloc
+import weakref
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -312,3 +313,42 @@ def test_checkpoints_take_a_twentieth_of_the_time_at_most(
     pauses = [later - earlier - seconds for earlier, later in pairwise(saved)]
     assert pauses
     assert all(between <= pause <= between + 15 for pause in pauses)
+
+
+@pytest.mark.parametrize("level", [1, 0])
+def test_a_continued_stage_does_not_hold_its_checkpoint_in_memory(
+    level: int, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, SETTINGS, monitor=StopInTheEnd(level))
+    load, loaded, held = RunArchive.load_checkpoint, list[weakref.ref[torch.Tensor]](), list[bool]()
+
+    def watched(archive: RunArchive) -> Saved | None:
+        state = load(archive)
+        assert state is not None
+        models = [state["model"], *(state["joint"] or {}).values()]
+        loaded.extend(weakref.ref(tensor) for model in models for tensor in model["params"].values())
+        loaded.extend(
+            weakref.ref(part) for model in models for each in model["moments"].values() for part in each.values()
+        )
+        return state
+
+    class Looks(Monitor):
+        def tick(self, stage: Stage, tick: Tick) -> None:
+            held.append(any(tensor() is not None for tensor in loaded))
+
+    monkeypatch.setattr(RunArchive, "load_checkpoint", watched)
+    resume(tmp_path / "run", scene, SETTINGS, monitor=Looks())
+    assert len(loaded) >= 10
+    assert held
+    assert not any(held)
+
+
+def test_predictions_that_joint_training_renders_are_not_cached_when_it_continues(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "run", scene, SETTINGS, monitor=StopInTheEnd(0))
+    checkpoint = RunArchive.open(tmp_path / "run").load_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint["joint"] is not None
+    record = resume(tmp_path / "run", scene, SETTINGS).manifest.record(0)
+    assert record.overhead_seconds["cache"] == checkpoint["overhead"]["cache"] > 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -149,6 +150,18 @@ def test_nothing_grows_without_large_errors_and_opacities_are_lowered() -> None:
     model, _ = refined(with_sizes(0.001 * EXTENT), ViewScores(torch.zeros(8), torch.zeros(8)))
     assert len(model) == 8
     torch.testing.assert_close(model.params["opacities"].sigmoid(), torch.full((8,), 0.8))
+
+
+@pytest.mark.parametrize(("reset_every", "left"), [(5, 6), (1000, 8)])
+def test_gaussians_as_large_as_the_scene_are_removed_once_opacities_were_reset(reset_every: int, left: int) -> None:
+    field = with_sizes(0.001 * EXTENT)(blob_field(8))
+    field.log_scales[:2, 1] = math.log(0.2 * EXTENT)
+    model = TrainableField.create(field, SETTINGS.learning_rates, EXTENT)
+    resets = replace(SETTINGS.densification, reset_every=reset_every)
+    control = MultiviewDensifier(schedule(replace(SETTINGS, densification=resets)), Multiview(grow_grad2d=2e-4), EXTENT)
+    nothing = ViewScores(torch.zeros(8), torch.zeros(8))
+    control.after_step(model, 10, rendered(torch.zeros(8), torch.zeros(8)), CAMERA, nothing)
+    assert torch.equal(model.params["means"].detach(), field.means[8 - left :])
 
 
 def test_faint_and_harmful_gaussians_are_removed_late() -> None:

@@ -19,6 +19,8 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.pose import corrected, turned_gradient, with_pose_gradient
 from lapgs_plugin.fields.rasterizer import Rasterizer
+from lapgs_plugin.hierarchy.cameras import level_camera
+from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rasterizers.gsplat.rasterizer import GsplatRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import refined, run_cameras, run_scene
@@ -28,6 +30,8 @@ from lapgs_plugin.runs.neighbours import predicted_poses
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training import poses
 from lapgs_plugin.training.checkpoint import TransformsState, check_transforms
+from lapgs_plugin.training.joint import JointFields
+from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.poses import ViewPoses
 from lapgs_plugin.training.settings import TrainSettings
 from tests.cli.run_folder import write_run, write_scene
@@ -132,6 +136,40 @@ def test_what_a_similarity_transform_of_the_scene_explains_is_removed() -> None:
     assert (remaining - own).abs().max() > 1e-3  # they have something in common, too
     torch.testing.assert_close(left(remaining), remaining, atol=1e-7, rtol=0)
     torch.testing.assert_close(remaining[:, 3:].mean(0), torch.zeros(3), atol=1e-7, rtol=0)
+
+
+def some_poses(scene: Scene) -> ViewPoses:
+    start = {
+        view.name: [0.01 * number, -0.02, 0.03, 0.1, 0.05 * number, -0.1] for number, view in enumerate(scene.train)
+    }
+    return ViewPoses.create(scene.train, start, scene.extent, torch.device("cpu"), 0, 100)
+
+
+def test_finished_fields_are_trained_at_refined_poses_which_learn_from_them() -> None:
+    scene, settings = ring_scene(train=4, test=0, size=(64, 48)), TrainSettings()
+    refined_poses, field, black = some_poses(scene), blob_field(80), torch.zeros(3)
+    model = TrainableField.create(field, settings.rates, scene.extent)
+    cameras = {view.name: view.camera for view in scene.train}
+    joint = JointFields({1: model}, cameras, CpuRasterizer(), black, refined_poses, {})
+    view, pyramid = scene.train[2], Pyramid()
+    image = joint.predictions(pyramid).get(view.name)
+    moved = corrected(level_camera(view.camera, 1), refined_poses.archived()[view.name])
+    expected = pyramid.up(CpuRasterizer().render_image(field, moved, background=black), (48, 64))
+    torch.testing.assert_close(image, expected, atol=1e-6, rtol=0)  # equal here
+    image.square().sum().backward()
+    assert refined_poses.transforms.grad is not None
+    assert [bool(row.any()) for row in refined_poses.transforms.grad] == [False, False, True, False]
+
+
+def test_cameras_are_at_the_poses_that_were_restored() -> None:
+    scene = ring_scene(train=4, test=0)
+    refined_poses, view = some_poses(scene), scene.train[1]
+    before = refined_poses.camera(view.name, view.camera)
+    state = refined_poses.state()
+    refined_poses.restore({**state, "transforms": torch.zeros_like(state["transforms"])})
+    after = refined_poses.camera(view.name, view.camera)
+    torch.testing.assert_close(after.world_to_camera, view.camera.world_to_camera, atol=1e-6, rtol=0)  # equal here
+    assert (before.world_to_camera - after.world_to_camera).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("hierarchy", ["laplacian", "nested"])

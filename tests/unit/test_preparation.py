@@ -88,6 +88,32 @@ def test_what_needs_no_photos_is_refused_before_they_are_read(
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
+class Two(Ranks):
+    """Two ranks of which only the first one is there."""
+
+    size = 2
+
+    @property
+    def together(self) -> str:
+        return "2 ranks"
+
+
+def test_a_run_is_not_replaced_by_one_whose_steps_have_fewer_views_than_ranks(folder: Path, tmp_path: Path) -> None:
+    control = TrainingControl(rasterizer="cpu")
+    before = trained(TrainRequest(folder, tmp_path / "run", SHORT, control=control))
+    fields = plys(before)
+    single = replace(SHORT, views_per_step="1")
+    again = TrainRequest(folder, tmp_path / "run", single, control=control, overwrite=True, ranks=Two())
+    with (
+        pytest.raises(UserInputError, match="2 ranks: a step of this run has 1 view, fewer than ranks"),
+        prepare(again),
+    ):
+        pass
+    after = RunArchive.open(tmp_path / "run")
+    assert after.manifest == before.manifest
+    assert plys(after) == fields
+
+
 def test_a_run_is_continued_as_it_was_prepared(folder: Path, tmp_path: Path) -> None:
     """The request of a run that continues has other defaults; the run keeps its own."""
     photos = SceneOptions(resolution="1/2", eval=True)
@@ -190,13 +216,6 @@ def test_a_run_that_views_ended_is_over(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_that_views_end_is_of_one_process(folder: Path, tmp_path: Path) -> None:
-    class Two(Ranks):
-        size = 2
-
-        @property
-        def together(self) -> str:
-            return "2 ranks"
-
     first = TrainRequest(folder, tmp_path / "run", replace(SHORT, stop="auto"), ranks=Two())
     with pytest.raises(UserInputError, match="2 ranks with --stop auto: ends runs of one process alone"):
         prepare(first)

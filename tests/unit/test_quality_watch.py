@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from lapgs_plugin.training.quality import (
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
-from tests.training_runs import Said, StopAt, resume, train
+from tests.training_runs import Said, StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
 
@@ -143,13 +144,14 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     assert len(aside) == 2
     fields: dict[tuple[int, int], Tensor] = {}
     along: dict[tuple[int, int], Tensor] = {}
+    colors: dict[tuple[int, int], Any] = {}
 
     def invented(evaluation: StageEvaluation, view: View, exposure: Tensor | None) -> ViewPsnr:
         run = evaluation.run
         assert view.name in aside
         assert run.appearance is not None
         moment = run.stage.level, run.counts.iteration
-        fields[moment] = run.model.field.means.detach().clone()
+        fields[moment], colors[moment] = run.model.field.means.detach().clone(), run.appearance.archived()
         if run.joint is not None:
             along[moment] = run.joint.fields[1].means.clone()
         return ViewPsnr(0.0, 20.0 + (moment in {(1, 16), (0, 36)}), None)
@@ -163,6 +165,7 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
     assert sum("1.00 dB better than the last one on 2 training views" in line for line in monitor.lines) == 2
     exposure = whole.exposure(0)
     assert exposure is not None
+    assert exposure == colors[0, 36] != colors[0, 40]
     assert set(exposure) == names.seen
     for level, iteration in ((1, 20), (0, 38)):
         folder = tmp_path / f"stopped_{level}"
@@ -171,6 +174,24 @@ def test_keep_best_archives_the_best_state_by_views_that_are_not_trained_on(
         again = resume(folder, scene, settings)
         assert [(again.field(each).means == whole.field(each).means).all() for each in (1, 0)] == [True, True]
         assert again.exposure(0) == exposure
+
+
+def test_an_extension_that_gains_nothing_leaves_the_fields_of_the_finished_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = ring_scene(train=12, test=0)
+    settings = TrainSettings(iterations=40, sh_degree=0, keep="best", appearance="none", joint=0.5)
+    monkeypatch.setattr(
+        StageEvaluation, "_psnr", lambda evaluation, *_: measured(20.0 + evaluation.run.counts.iteration)
+    )
+    finished = plys(train(tmp_path / "run", scene, settings))
+    monkeypatch.setattr(
+        StageEvaluation, "_psnr", lambda evaluation, *_: measured(40.0 - evaluation.run.counts.iteration)
+    )
+    longer = replace(settings, iterations=60, extended=20)
+    archive = resume(tmp_path / "run", scene, longer)
+    assert archive.manifest.record(0).iterations == 40
+    assert plys(archive) == finished
 
 
 def test_few_views_for_many_iterations_are_named() -> None:

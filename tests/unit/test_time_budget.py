@@ -138,6 +138,14 @@ def test_levels_share_the_seconds_so_that_they_share_the_iterations() -> None:
     assert shares == pytest.approx([stage.iterations / plan.iterations for stage in plan], abs=0.02)
 
 
+@pytest.mark.parametrize(("first", "iterations"), [(0.01, 700), (2.0, 500)])
+def test_views_to_measure_afterwards_take_their_part_of_the_seconds(first: float, iterations: int) -> None:
+    """Of ten seconds three; that a slow first iteration leaves none of them is not concluded from it alone."""
+    clock = Clock(0.0)
+    budget = StageBudget(clock, 10.0, 1000, afterwards=300)
+    assert trained(budget, clock, lambda i: first if i == 1 else 0.01) == pytest.approx(iterations, rel=0.03)
+
+
 def test_a_stage_without_time_ends_after_its_first_step() -> None:
     clock = Clock(0.0)
     assert trained(StageBudget(clock, 10.0, 1000, reserve=11.0), clock, lambda i: 0.01) == 1

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from torch import Tensor
 
 from lapgs_plugin.runs.manifest import LevelRecord
 from lapgs_plugin.runs.training_figures import finest_gains, last_view_psnrs, smaller_gains, weak_levels
+from lapgs_plugin.scenes.scene import View
+from lapgs_plugin.training.evaluation import StageEvaluation, ViewPsnr
+from lapgs_plugin.training.quality import set_aside
 from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Mcmc
 from tests.training_runs import Said, rendered_gains, train
@@ -99,6 +103,26 @@ def test_measured_gains_are_those_of_the_archived_fields(changed: dict[str, Any]
     archive = train(tmp_path / "run", scene, settings)
     gains = finest_gains(last_view_psnrs(archive.history(), along=True))
     assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 3e-8 seen
+
+
+def test_gains_beside_a_state_from_before_joint_training_are_those_of_the_archived_fields(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By invented figures of the views set aside, the residual is best before its base is trained along."""
+    scene = ring_scene(train=12, test=4)
+    aside, psnr_of = {view.name for view in set_aside(scene.train)}, StageEvaluation._psnr
+
+    def invented(evaluation: StageEvaluation, view: View, exposure: Tensor | None = None) -> ViewPsnr:
+        if view.name not in aside:
+            return psnr_of(evaluation, view, exposure)
+        moment = evaluation.run.stage.level, evaluation.run.counts.iteration
+        return ViewPsnr(20.0 + (moment == (0, 12)), 20.0, None)
+
+    monkeypatch.setattr(StageEvaluation, "_psnr", invented)
+    settings = TrainSettings(iterations=120, levels=2, sh_degree=0, appearance="none", keep="best", joint=0.75)
+    archive = train(tmp_path / "run", scene, settings)
+    gains = finest_gains(last_view_psnrs(archive.history(), along=True))
+    assert gains == pytest.approx(rendered_gains(archive, scene.test), abs=1e-3)  # 0.026 with the base trained along
 
 
 def test_a_test_every_few_iterations_does_not_replace_the_last_one(tmp_path: Path) -> None:
