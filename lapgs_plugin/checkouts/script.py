@@ -14,6 +14,7 @@ from pathlib import Path
 from types import CodeType, ModuleType, TracebackType
 
 from lapgs_plugin.checkouts.other_trainers import known_trainer
+from lapgs_plugin.checkouts.rewriting import FUTURE
 from lapgs_plugin.checkouts.syntax import parsed
 from lapgs_plugin.errors import UserInputError
 
@@ -104,10 +105,9 @@ def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:
         )
     main = ast.Module(body=list(blocks), type_ignores=[])
     definitions = ast.Module(body=[node for node in tree.body if node not in blocks], type_ignores=[])
-    # dont_inherit: the script must not get this file's future statements.
-    return compile(definitions, str(path), "exec", dont_inherit=True), compile(
-        main, str(path), "exec", dont_inherit=True
-    )
+    # dont_inherit: the script must not get this file's future statements. Its own are among its definitions.
+    defining = compile(definitions, str(path), "exec", dont_inherit=True)
+    return defining, compile(main, str(path), "exec", defining.co_flags & FUTURE, dont_inherit=True)
 
 
 def _is_main_block(node: ast.stmt) -> bool:

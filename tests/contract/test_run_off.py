@@ -152,6 +152,19 @@ def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
         assert caught.traceback[-1].lineno == 2
 
 
+def test_future_statements_of_a_script_hold_in_its_main_block(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "train.py"
+    script.write_text(
+        "from __future__ import annotations\n"
+        'if __name__ == "__main__":\n    def train(scene: OnlyForTypeCheckers): print(scene)\n    train("fox")\n'
+    )
+    with loaded_script(script, []) as definitions:
+        definitions.run_main()
+    assert capsys.readouterr().out == "fox\n"
+
+
 def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
     """Some packages put objects with any attribute into `sys.modules`; these must not break the end of a run."""
     script = tmp_path / "train.py"
