@@ -15,7 +15,7 @@ from types import CodeType, ModuleType, TracebackType
 
 from lapgs_plugin.checkouts.other_trainers import known_trainer
 from lapgs_plugin.checkouts.rewriting import FUTURE
-from lapgs_plugin.checkouts.syntax import parsed
+from lapgs_plugin.checkouts.syntax import file_of_script, parsed
 from lapgs_plugin.errors import UserInputError
 
 
@@ -48,7 +48,7 @@ def frames_of_script(error: BaseException) -> TracebackType | None:
 
 
 def require_script(path: Path) -> Path:
-    """Return the absolute path of a script.
+    """Return the absolute path of a script, or of its target if it is a link.
 
     Raises:
         UserInputError: it is not a file.
@@ -58,7 +58,7 @@ def require_script(path: Path) -> Path:
             known_trainer(path) or "expected the training script of a checkout, as in `lapgs run train.py -s SCENE`"
         )
         raise UserInputError(f"{path} is not a file; {advice}")
-    return path.absolute()
+    return file_of_script(path)
 
 
 @contextmanager

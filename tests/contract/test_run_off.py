@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import typer
 from torch import Tensor
 
 from lapgs_plugin.checkouts.script import loaded_script
+from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.app import run as main
 from lapgs_plugin.errors import UserInputError
@@ -139,6 +143,22 @@ def test_a_script_finds_the_modules_that_python_finds(
     with loaded_script(script, []):
         assert sys.path == [str(tmp_path), *(search_path if "pytest" in launcher else search_path[1:])]
     assert sys.path == search_path
+
+
+def test_a_script_that_is_a_link_finds_the_modules_beside_its_target(tmp_path: Path) -> None:
+    link = tmp_path / "train.py"
+    link.symlink_to(os.path.relpath(STUBS["graphdeco"].script, tmp_path))
+    assert CheckoutSource.read(link).root.samefile(STUBS["graphdeco"].script.parent)
+    (tmp_path / "real").mkdir()
+    script, link = tmp_path / "real" / "train.py", tmp_path / "mine.py"
+    (script.parent / "beside_it.py").write_text("answer = 42\n")
+    script.write_text('import beside_it\nif __name__ == "__main__":\n    print(beside_it.answer)\n')
+    link.symlink_to("real/train.py")
+    by_python = subprocess.run([sys.executable, link], capture_output=True, text=True, check=True).stdout
+    output = io.StringIO()
+    with redirect_stdout(output), loaded_script(link, []) as definitions:
+        definitions.run_main()
+    assert output.getvalue() == by_python == "42\n"
 
 
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
