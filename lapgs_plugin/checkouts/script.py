@@ -6,6 +6,7 @@ Symbols are replaced between the two, when everything that the script defines an
 from __future__ import annotations
 
 import ast
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,9 @@ from lapgs_plugin.checkouts.other_trainers import known_trainer
 from lapgs_plugin.checkouts.rewriting import FUTURE
 from lapgs_plugin.checkouts.syntax import file_of_script, parsed
 from lapgs_plugin.errors import UserInputError
+
+INSTALLED = {"site-packages", "dist-packages"}
+"""Names of folders of installed packages."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +89,11 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         exec(definitions, module.__dict__)
         yield Script(path, module, main)
     finally:
+        # Some scripts lie in a folder of the checkout, and add its root themselves.
+        folders = {path.parent, *set(path.parents).intersection(map(_plain, set(sys.path).difference(before[1])))}
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
-        for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
+        for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], folders)]:
             del sys.modules[name]
 
 
@@ -119,9 +125,17 @@ def _is_main_block(node: ast.stmt) -> bool:
     return names == ["__name__"] and values == ["__main__"]
 
 
-def _is_under(module: ModuleType | None, folder: Path) -> bool:
+def _plain(entry: str) -> Path:
+    """Return an absolute path without `..`; links stay."""
+    return Path(os.path.normpath(Path(entry).absolute()))
+
+
+def _is_under(module: ModuleType | None, folders: Iterable[Path]) -> bool:
+    """Return whether a module lies in one of these folders, and is not installed in an environment there."""
     # Entries of `sys.modules` may be objects that have any attribute, including `__path__`.
     known = getattr(module, "__dict__", {})
     package = known.get("__path__")
-    places = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
-    return any(isinstance(entry, str) and Path(entry).is_relative_to(folder) for entry in places)
+    entries = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
+    places = [_plain(entry) for entry in entries if isinstance(entry, str)]
+    own = [place for place in places if INSTALLED.isdisjoint(place.parts)]
+    return any(place.is_relative_to(folder) for place in own for folder in folders)

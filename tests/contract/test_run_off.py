@@ -185,6 +185,28 @@ def test_future_statements_of_a_script_hold_in_its_main_block(
     assert capsys.readouterr().out == "fox\n"
 
 
+def test_the_checkouts_modules_are_removed_and_installed_packages_stay(tmp_path: Path) -> None:
+    """Its script may lie in a folder of it, and an environment, too: packages there cannot be imported twice."""
+    installed = tmp_path / "ms" / ".venv" / "lib" / "python3" / "site-packages"
+    for folder, name in ((tmp_path, "of_the_checkout"), (installed, "of_the_environment")):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.py").touch()
+    script = tmp_path / "ms" / "train.py"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nsys.path.append(str(Path(__file__).parents[1]))\n"
+        f"sys.path.append({str(installed)!r})\n"
+        'import of_the_checkout, of_the_environment\nif __name__ == "__main__":\n    pass\n'
+    )
+    try:
+        with loaded_script(script, []):
+            assert {"of_the_checkout", "of_the_environment"} <= sys.modules.keys()
+        assert "of_the_checkout" not in sys.modules
+        assert "of_the_environment" in sys.modules
+    finally:
+        for name in {"of_the_checkout", "of_the_environment"} & sys.modules.keys():
+            del sys.modules[name]
+
+
 def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:
     """Some packages put objects with any attribute into `sys.modules`; these must not break the end of a run."""
     script = tmp_path / "train.py"
