@@ -13,10 +13,14 @@ from typing import Any
 from lapgs_plugin.adapters.base import BackboneAdapter
 from lapgs_plugin.adapters.info import BackboneInfo
 from lapgs_plugin.checkouts.attachment import Replacement
+from lapgs_plugin.checkouts.schedule import Schedule
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 
 SIMPLIFICATIONS = ("simp_iteration1", "simp_iteration2")
 """Arguments of its script: the iterations after which it simplifies."""
+
+CLOCK, UNLOCK = "update_learning_rate", "oneupSHdegree"
+"""Methods of its model that begin an iteration, and unlock an SH degree."""
 
 SH_EVERY = 1000
 """Iterations between two SH degrees."""
@@ -56,10 +60,18 @@ class Adapter(BackboneAdapter):
         return [
             Replacement(model, "reinitial_pts", partial(_unless, in_residual), "training()", ("self", "pts", "rgb")),
             Replacement(model, "create_from_pcd", partial(self._with_sh, in_residual), start, ("self", "pcd")),
-            Replacement(
-                model, "update_learning_rate", partial(_unlocking_sh, in_residual), clock, ("self", "iteration")
+            *(
+                [Replacement(model, CLOCK, partial(_unlocking_sh, in_residual), clock, ("self", "iteration"))]
+                if self._unlocks_sh_late
+                else []
             ),
         ]
+
+    @property
+    def _unlocks_sh_late(self) -> bool:
+        """Whether the script unlocks SH from some iteration on; its plain 3DGS does so from the first."""
+        unlocking = [event for event in Schedule(self.profile.source.training).events if UNLOCK in event.calls]
+        return all(any(operand.is_bound for operand in event.operands) for event in unlocking)
 
     def _with_sh(self, in_residual: Callable[[], bool], original: Callable[..., None]) -> Callable[..., None]:
         """Give a residual all SH coefficients; the checkout makes its model without."""

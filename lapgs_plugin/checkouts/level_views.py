@@ -121,10 +121,14 @@ class SceneImages:
     """
 
     def __init__(self) -> None:
-        self._keep: Keep = lambda tensor: lambda: tensor
-        self._images: dict[str, FullSizeImage] = {}
         # Some checkouts make their cameras in several threads.
         self._making, self._lock = threading.local(), threading.Lock()
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop all images and masks: a script may train on another scene after one, in the same process."""
+        self._keep: Keep = lambda tensor: lambda: tensor
+        self._images: dict[str, FullSizeImage] = {}
         self._masks: dict[str, Callable[[], Tensor]] = {}
 
     def keep_on_disk(self, folder: Path) -> None:

@@ -117,17 +117,19 @@ class _Uses:
     def waiting(self, numbers: Iterable[ast.expr] = (), names: Iterable[str] = ()) -> set[ast.AST] | None:
         """Return the expressions by which numbers, or those of variables, get to where they cannot be late.
 
-        None if they get into variables that others see.
+        None if they get into variables that others see, or that are changed by other operators in place.
         """
-        shared = _shared(self._nodes)
+        unfit = _shared(self._nodes) | _changed_otherwise(self._nodes)
         known, waiting = set(names), set[ast.AST]()
+        if known & unfit:
+            return None
         open_numbers = [*numbers, *(number for name in known for number in self._loads(name))]
         while open_numbers:
             number = open_numbers.pop()
             while _computes(self._parents[number], number):
                 number = self._parents[number]  # type: ignore[assignment]  # an expression, as it computes
             if (name := self._variable(number)) is not None:
-                if name in shared:
+                if name in unfit:
                     return None
                 if name not in known:
                     known.add(name)
@@ -208,6 +210,12 @@ def _method(call: ast.AST) -> str:
 def _shared(nodes: Iterable[ast.AST]) -> set[str]:
     """Return the variables that a function shares with others."""
     return {name for node in nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
+
+
+def _changed_otherwise(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the variables that are changed in place by operators that late numbers do not have, such as `**=`."""
+    changes = (node for node in nodes if isinstance(node, ast.AugAssign) and not isinstance(node.op, ARITHMETIC))
+    return {change.target.id for change in changes if isinstance(change.target, ast.Name)}
 
 
 def _local_events(nodes: Sequence[ast.AST]) -> set[str]:

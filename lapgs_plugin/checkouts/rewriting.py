@@ -7,7 +7,7 @@ import ast
 import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -16,6 +16,12 @@ from lapgs_plugin.checkouts.syntax import parsed_quietly
 
 FACTORY = "_lapgs_recompiled"
 """Name of the function that defines the function again; what its tree calls beside its globals are its arguments."""
+
+FUNCTION = "_lapgs_function"
+"""Name of the function inside of that: by its own it would be found where its body names a global."""
+
+RESTORED = "_lapgs_restored"
+"""Name of the decorator that gives it back its name, defaults and annotations."""
 
 RECOMPILATION = "_lapgs_recompilation"
 """Attribute of recompiled functions: their `_Recompilation`."""
@@ -136,16 +142,41 @@ def recompiled(
     names = {**({} if before is None else before.names), **(names or {})}
     original = inspect.unwrap(function)
     assert isinstance(original, FunctionType), "as it has a tree"
-    module = ast.parse(f"def {FACTORY}({', '.join(names)}):\n    return {tree.name}")
+    module = ast.parse(f"def {FACTORY}({', '.join((RESTORED, *names))}):\n    return {FUNCTION}")
     factory = module.body[0]
     assert isinstance(factory, ast.FunctionDef), "as it was written"
-    factory.body.insert(0, ast.fix_missing_locations(tree))
+    factory.body.insert(0, ast.fix_missing_locations(_without_name_and_defaults(tree)))
     # The checkout's future statements, and not those of this file.
     flags = original.__code__.co_flags & FUTURE
     compiled = compile(module, original.__code__.co_filename, "exec", flags, dont_inherit=True)
     defined: dict[str, Any] = {}
     exec(compiled, original.__globals__, defined)
-    recompiled_function: Callable[..., Any] = defined[FACTORY](*names.values())
+    recompiled_function: Callable[..., Any] = defined[FACTORY](partial(_restored, original), *names.values())
     recompiled_function.__qualname__ = function.__qualname__
     setattr(recompiled_function, RECOMPILATION, _Recompilation(tree, names))
     return recompiled_function
+
+
+def _without_name_and_defaults(tree: ast.FunctionDef) -> ast.FunctionDef:
+    """Return the definition of a function with what `_restored` gives back left out.
+
+    Defaults and annotations may name what only the body of a class knows, and may not be evaluated a second time.
+    """
+    definition, arguments = copy.copy(tree), copy.deepcopy(tree.args)
+    arguments.defaults = [ast.Constant(None) for _ in arguments.defaults]
+    arguments.kw_defaults = [None if default is None else ast.Constant(None) for default in arguments.kw_defaults]
+    for argument in ast.walk(arguments):
+        if isinstance(argument, ast.arg):
+            argument.annotation = None
+    definition.name, definition.args, definition.returns = FUNCTION, arguments, None
+    definition.decorator_list = [*tree.decorator_list, ast.Name(RESTORED, ast.Load())]
+    return definition
+
+
+def _restored(original: FunctionType, function: FunctionType) -> FunctionType:
+    """Give a recompiled function the name, the defaults and the annotations of the original."""
+    function.__code__ = function.__code__.replace(co_name=original.__code__.co_name)
+    function.__name__, function.__qualname__ = original.__name__, original.__qualname__
+    function.__defaults__, function.__kwdefaults__ = original.__defaults__, original.__kwdefaults__
+    function.__annotations__ = original.__annotations__
+    return function

@@ -6,6 +6,7 @@ Symbols are replaced between the two, when everything that the script defines an
 from __future__ import annotations
 
 import ast
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,8 +15,12 @@ from pathlib import Path
 from types import CodeType, ModuleType, TracebackType
 
 from lapgs_plugin.checkouts.other_trainers import known_trainer
-from lapgs_plugin.checkouts.syntax import parsed
+from lapgs_plugin.checkouts.rewriting import FUTURE
+from lapgs_plugin.checkouts.syntax import file_of_script, parsed
 from lapgs_plugin.errors import UserInputError
+
+INSTALLED = {"site-packages", "dist-packages"}
+"""Names of folders of installed packages."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ def frames_of_script(error: BaseException) -> TracebackType | None:
 
 
 def require_script(path: Path) -> Path:
-    """Return the absolute path of a script.
+    """Return the absolute path of a script, or of its target if it is a link.
 
     Raises:
         UserInputError: it is not a file.
@@ -57,7 +62,7 @@ def require_script(path: Path) -> Path:
             known_trainer(path) or "expected the training script of a checkout, as in `lapgs run train.py -s SCENE`"
         )
         raise UserInputError(f"{path} is not a file; {advice}")
-    return path.absolute()
+    return file_of_script(path)
 
 
 @contextmanager
@@ -84,9 +89,11 @@ def loaded_script(path: Path, arguments: Sequence[str]) -> Iterator[Script]:
         exec(definitions, module.__dict__)
         yield Script(path, module, main)
     finally:
+        # Some scripts lie in a folder of the checkout, and add its root themselves.
+        folders = {path.parent, *set(path.parents).intersection(map(_plain, set(sys.path).difference(before[1])))}
         sys.argv, sys.path[:], sys.stdout, sys.stderr, sys.modules["__main__"] = before
         # All are found before any is removed: a package without an __init__ looks up its parent when it is inspected.
-        for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], path.parent)]:
+        for name in [name for name in set(sys.modules) - known if _is_under(sys.modules[name], folders)]:
             del sys.modules[name]
 
 
@@ -104,10 +111,9 @@ def _split(tree: ast.Module, path: Path) -> tuple[CodeType, CodeType]:
         )
     main = ast.Module(body=list(blocks), type_ignores=[])
     definitions = ast.Module(body=[node for node in tree.body if node not in blocks], type_ignores=[])
-    # dont_inherit: the script must not get this file's future statements.
-    return compile(definitions, str(path), "exec", dont_inherit=True), compile(
-        main, str(path), "exec", dont_inherit=True
-    )
+    # dont_inherit: the script must not get this file's future statements. Its own are among its definitions.
+    defining = compile(definitions, str(path), "exec", dont_inherit=True)
+    return defining, compile(main, str(path), "exec", defining.co_flags & FUTURE, dont_inherit=True)
 
 
 def _is_main_block(node: ast.stmt) -> bool:
@@ -119,9 +125,17 @@ def _is_main_block(node: ast.stmt) -> bool:
     return names == ["__name__"] and values == ["__main__"]
 
 
-def _is_under(module: ModuleType | None, folder: Path) -> bool:
+def _plain(entry: str) -> Path:
+    """Return an absolute path without `..`; links stay."""
+    return Path(os.path.normpath(Path(entry).absolute()))
+
+
+def _is_under(module: ModuleType | None, folders: Iterable[Path]) -> bool:
+    """Return whether a module lies in one of these folders, and is not installed in an environment there."""
     # Entries of `sys.modules` may be objects that have any attribute, including `__path__`.
     known = getattr(module, "__dict__", {})
     package = known.get("__path__")
-    places = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
-    return any(isinstance(entry, str) and Path(entry).is_relative_to(folder) for entry in places)
+    entries = [known.get("__file__"), *(package if isinstance(package, Iterable) else ())]
+    places = [_plain(entry) for entry in entries if isinstance(entry, str)]
+    own = [place for place in places if INSTALLED.isdisjoint(place.parts)]
+    return any(place.is_relative_to(folder) for place in own for folder in folders)

@@ -20,6 +20,7 @@ from lapgs_plugin.checkouts.syntax import (
     called_name,
     called_names,
     executed_on_import,
+    file_of_script,
     location,
     parsed,
     parsed_quietly,
@@ -124,7 +125,7 @@ class CheckoutSource:
             UserInputError: it is not Python, or not the training script of a 3DGS checkout; the line says what is
                 missing.
         """
-        typed, script = script, script.absolute()
+        typed, script = script, file_of_script(script)
         known, changed = _READ.get(script, (None, {}))
         if known is not None and _times(changed) == changed:
             return known

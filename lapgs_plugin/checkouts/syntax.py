@@ -10,6 +10,11 @@ from pathlib import Path
 from lapgs_plugin.errors import UserInputError
 
 
+def file_of_script(path: Path) -> Path:
+    """Return the absolute path of a script; if it is a link, of its target, beside which Python looks for modules."""
+    return (path.parent / path.readlink() if path.is_symlink() else path).absolute()
+
+
 def parsed(path: Path) -> ast.Module:
     """Return the syntax tree of a script or module, not to be changed: it is kept until the file changes.
 

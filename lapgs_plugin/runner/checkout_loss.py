@@ -31,6 +31,9 @@ LARGEST_DIFFERENCE = 1e-3
 L1_PRECISION = 1e-3
 """The same of L1, as a factor on it: nothing is filtered there."""
 
+TORCH_BACKWARD = Tensor.backward
+"""PyTorch's own method."""
+
 
 def in_our_kernels(original: Callable[..., Any]) -> Callable[..., Any]:
     """Return the replacement of a function that computes SSIM. Where it differs from ours, it is called itself."""
@@ -54,8 +57,8 @@ def in_one_kernel(training: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _backward(loss: Any) -> None:
-    """Do `loss.backward()`."""
-    if type(loss) is Tensor and loss.ndim == 0:
+    """Do `loss.backward()`, by PyTorch's method if something has taken its place, such as `--breakdown`."""
+    if type(loss) is Tensor and loss.ndim == 0 and Tensor.backward is TORCH_BACKWARD:
         backward(loss)
     else:
         loss.backward()

@@ -66,6 +66,7 @@ def prepare(context: CheckoutContext, call: TrainingCall) -> Iterator[TrainingRu
     if not source.exists():
         raise UserInputError(f"the scene {source} does not exist; give the script its folder, as in -s data/garden")
     require_colmap_or_transforms(source)
+    images.clear()
     if settings.images_on == "disk":  # that of the run: the one of temporary files may be in memory
         images.keep_on_disk(next(filter(is_folder, (absolute, *absolute.parents))))
     with tempfile.TemporaryDirectory(prefix="lapgs-scene-") as scratch:

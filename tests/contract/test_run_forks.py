@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lapgs_plugin.adapters import mini_splatting
 from lapgs_plugin.adapters.registry import recognise
 from lapgs_plugin.checkouts.training_call import StageWindow, TrainingCall
 from lapgs_plugin.hierarchy.plan import Stage
@@ -263,6 +265,33 @@ def test_mini_splatting_makes_a_base_anew_and_no_residual(
 def test_mini_splatting_simplifies_once_in_one_call(run_of: Callable[[str, str], tuple[RunArchive, Seen]]) -> None:
     _, seen = run_of("mini", "nested")
     assert seen.made_anew == [60]
+
+
+@pytest.mark.parametrize("late", [True, False], ids=["ms/train.py", "gs/train.py"])
+def test_mini_splatting_unlocks_sh_of_a_residual_once_an_interval(
+    late: bool, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of its scripts, plain 3DGS, does so itself from the start; the others after their simplification."""
+    monkeypatch.setattr(mini_splatting, "SH_EVERY", 7)
+    script = Path(shutil.copytree(CHECKOUTS, tmp_path / "copy")) / "mini" / "ms" / "train.py"
+    text, condition = script.read_text(encoding="utf-8"), "if iteration % 1000 == 0 and iteration > simp_iteration1:"
+    assert condition in text
+    own = condition.replace("1000", "7") if late else "if iteration % 7 == 0:"
+    script.write_text(text.replace(condition, own), encoding="utf-8")
+    unlocked: list[int] = []
+    with captured(tmp_path, []), loaded(FORKS["mini"], scene, tmp_path / "run", script=script) as adapter:
+        seen, model = Seen(), adapter.profile.model
+        watch(adapter, seen)
+        one_more = model.oneupSHdegree
+
+        def oneupSHdegree(self: Any) -> None:
+            unlocked.append(seen.now)
+            one_more(self)
+
+        model.oneupSHdegree = oneupSHdegree
+        drive(adapter, hierarchy="laplacian")
+    of_residual = [now for now in unlocked if now > 30]
+    assert len(of_residual) == 60 // 7
 
 
 def test_efficientgs_unlocks_sh_of_a_residual_at_its_start(scene: Path, tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import typer
 from torch import Tensor
 
 from lapgs_plugin.checkouts.script import loaded_script
+from lapgs_plugin.checkouts.source import CheckoutSource
 from lapgs_plugin.cli.app import app
 from lapgs_plugin.cli.app import run as main
 from lapgs_plugin.errors import UserInputError
@@ -141,6 +145,22 @@ def test_a_script_finds_the_modules_that_python_finds(
     assert sys.path == search_path
 
 
+def test_a_script_that_is_a_link_finds_the_modules_beside_its_target(tmp_path: Path) -> None:
+    link = tmp_path / "train.py"
+    link.symlink_to(os.path.relpath(STUBS["graphdeco"].script, tmp_path))
+    assert CheckoutSource.read(link).root.samefile(STUBS["graphdeco"].script.parent)
+    (tmp_path / "real").mkdir()
+    script, link = tmp_path / "real" / "train.py", tmp_path / "mine.py"
+    (script.parent / "beside_it.py").write_text("answer = 42\n")
+    script.write_text('import beside_it\nif __name__ == "__main__":\n    print(beside_it.answer)\n')
+    link.symlink_to("real/train.py")
+    by_python = subprocess.run([sys.executable, link], capture_output=True, text=True, check=True).stdout
+    output = io.StringIO()
+    with redirect_stdout(output), loaded_script(link, []) as definitions:
+        definitions.run_main()
+    assert output.getvalue() == by_python == "42\n"
+
+
 def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
     """Exit codes and exceptions are passed on."""
     for statement, raised in (("sys.exit(3)", SystemExit), ("1 / 0", ZeroDivisionError)):
@@ -150,6 +170,41 @@ def test_a_script_ends_as_it_would_by_itself(tmp_path: Path) -> None:
             definitions.run_main()
         assert caught.traceback[-1].path == script
         assert caught.traceback[-1].lineno == 2
+
+
+def test_future_statements_of_a_script_hold_in_its_main_block(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "train.py"
+    script.write_text(
+        "from __future__ import annotations\n"
+        'if __name__ == "__main__":\n    def train(scene: OnlyForTypeCheckers): print(scene)\n    train("fox")\n'
+    )
+    with loaded_script(script, []) as definitions:
+        definitions.run_main()
+    assert capsys.readouterr().out == "fox\n"
+
+
+def test_the_checkouts_modules_are_removed_and_installed_packages_stay(tmp_path: Path) -> None:
+    """Its script may lie in a folder of it, and an environment, too: packages there cannot be imported twice."""
+    installed = tmp_path / "ms" / ".venv" / "lib" / "python3" / "site-packages"
+    for folder, name in ((tmp_path, "of_the_checkout"), (installed, "of_the_environment")):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.py").touch()
+    script = tmp_path / "ms" / "train.py"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nsys.path.append(str(Path(__file__).parents[1]))\n"
+        f"sys.path.append({str(installed)!r})\n"
+        'import of_the_checkout, of_the_environment\nif __name__ == "__main__":\n    pass\n'
+    )
+    try:
+        with loaded_script(script, []):
+            assert {"of_the_checkout", "of_the_environment"} <= sys.modules.keys()
+        assert "of_the_checkout" not in sys.modules
+        assert "of_the_environment" in sys.modules
+    finally:
+        for name in {"of_the_checkout", "of_the_environment"} & sys.modules.keys():
+            del sys.modules[name]
 
 
 def test_what_is_no_module_does_not_matter_at_the_end(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from tests.contract.stub_runs import (
     composed_psnr,
     drive,
     drive_residuals,
+    edited_graphdeco,
     loaded,
     run_hierarchy,
     run_residuals,
@@ -338,3 +339,25 @@ def test_a_scene_in_small_units_is_said(scene: Path, tmp_path: Path, caplog: pyt
     lines = "\n".join(record.getMessage() for record in caplog.records)
     assert "nearer to the cameras than 0.2, the near plane" in lines
     assert "no Gaussian will be visible at first in 10 of 10 training views" in lines
+
+
+def test_a_script_that_trains_on_two_scenes(scene: Path, big: Path, tmp_path: Path) -> None:
+    """Photos of the first scene, which are smaller here, say nothing about the second one."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    call = """    training(
+        lp.extract(args),
+        op.extract(args),
+        pp.extract(args),
+        args.test_iterations,
+        args.save_iterations,
+        args.checkpoint_iterations,
+        args.start_checkpoint,
+        args.debug_from,
+    )
+"""
+    other = f"    args.source_path, args.model_path = {str(big)!r}, {str(second)!r}\n"
+    script = edited_graphdeco(tmp_path / "copy", "train.py", call, call + other + call)
+    with captured(first, []), loaded(STUBS["graphdeco"], scene, first, *SHORT, script=script) as adapter:
+        drive(adapter)
+    for folder, size in ((first, (64, 48)), (second, (96, 66))):
+        assert [record.image_size for record in RunArchive.open(folder).manifest.records][-1] == size

@@ -299,3 +299,17 @@ def test_a_closure_has_no_tree() -> None:
     assert tree_of(closure) is None
     assert tree_of(losses) is not None
     assert tree_of(len) is None
+
+
+def test_a_sum_that_is_squared_is_not_late(
+    load_module: Callable[[str], ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        "def training(losses):\n    total = 0.0\n    for loss in losses:\n        total += loss.item()\n"
+        "        total **= 2\n        print(f'{total:.6f}')\n"
+    )
+    training = load_module(text).training
+    training(losses(3))
+    expected = capsys.readouterr().out
+    reading_late(training)(losses(3))
+    assert capsys.readouterr().out == expected

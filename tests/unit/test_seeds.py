@@ -26,6 +26,19 @@ def test_seeds_that_are_set_meanwhile_move() -> None:
     assert numbers == (random.Random(3).random(), np.random.RandomState(3).random_sample(), expected)
 
 
+def test_seeds_of_cuda_devices_alone_move_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many scripts set them after all others, once for one device and once for all of them; PyTorch by itself does."""
+    seeded: dict[str, list[int]] = {"manual_seed": [], "manual_seed_all": []}
+    for name, seeds in seeded.items():
+        monkeypatch.setattr(torch.cuda, name, seeds.append)
+    with moved_seeds(3):
+        torch.cuda.manual_seed(7)
+        torch.cuda.manual_seed_all(7)
+        torch.manual_seed(7)
+    torch.cuda.manual_seed(7)
+    assert seeded == {"manual_seed": [10, 7], "manual_seed_all": [10, 10]}
+
+
 def test_other_seeds_stay() -> None:
     with moved_seeds(3):
         random.seed("words")
