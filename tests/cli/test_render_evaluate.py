@@ -265,6 +265,31 @@ def test_training_views_are_not_said_to_have_the_exposure_of_their_neighbours(sc
     assert (metrics["split"], metrics["exposure_compensated"], metrics["exposure_predicted"]) == ("train", True, False)
 
 
+def test_pixels_outside_of_masks_change_no_psnr_of_any_level(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    run = write_run(tmp_path / "run", scene)
+    inside = np.zeros((HEIGHT, WIDTH), np.uint8)
+    inside[5:-9, 7:-15] = 255
+    for photo in sorted((scene / "photos").iterdir()):
+        (scene / "masks" / "photos").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(scene / "masks" / "photos" / photo.name), inside)
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["scene"]["masks"] = "masks"
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    measured = []
+    for outside in (None, 255):
+        for photo in sorted((scene / "photos").iterdir()):
+            image = read_image(photo).numpy().transpose(1, 2, 0)[..., ::-1] * 255
+            image = image if outside is None else np.where(inside[..., None] > 0, image, outside)
+            cv2.imwrite(str(photo), np.rint(image).astype(np.uint8))
+        lapgs("eval", run)
+        metrics = json.loads((run / "metrics.json").read_text())
+        assert metrics["masked"]
+        of_levels = [metrics["levels"][level][key] for level in "10" for key in ("psnr", "upsampled_psnr")]
+        measured.append([metrics["psnr"], metrics["fitted_psnr"], *of_levels])
+    np.testing.assert_allclose(*measured, atol=1e-3)
+
+
 def test_another_scene_is_refused(run: Path, tmp_path: Path) -> None:
     other = write_scene(tmp_path / "other", size=(64, 48))
     with pytest.raises(RunFolderError, match=r"level 1 would be 32x24 pixels, the run was trained at 28x20"):

@@ -131,13 +131,14 @@ def test_cameras_out_of_order_are_walked_past_in_turn() -> None:
 def test_an_order_of_many_cameras_takes_little_more_memory_than_their_distances() -> None:
     count = 1000
     cameras = [ring_camera(angle) for angle in np.random.default_rng(0).uniform(0, 6, count)]
+    walking_order(cameras[:3])  # imports what it needs
     tracemalloc.start()
     try:
         walking_order(cameras)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < 1.5 * 8 * count**2  # 1.1 seen; differences of all pairs take three times as much
+    assert peak < 1.5 * 8 * count**2  # 1.03 seen; differences of all pairs take three times as much
 
 
 def test_cameras_in_order_are_left_alone() -> None:
