@@ -133,14 +133,20 @@ def export(
 
 def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
     """Write the field of each chosen level as a file."""
+    from lapgs_plugin.rasterizers.choice import is_antialiased
+
     levels = _levels(archive, settings.level)
     fields = {level: archive.field(level) for level in levels}  # a damaged one is refused before anything is written
     fields = _cleaned(archive, fields, settings)
+    antialiased = is_antialiased(archive.manifest)
     _make(folder)
     for level, field in fields.items():
         path = folder / f"{_level_name(archive, level)}{SUFFIXES[settings.file_format]}"
-        _write_field(field, path, _note(archive, level), settings.file_format)
-        _print_written(path, field, ", a residual" if field.signed else "")
+        _write_field(field, path, _note(archive, level), settings.file_format, antialiased)
+        remark = ", a residual" if field.signed else ""
+        if antialiased and settings.file_format in (PLY, GLB):
+            remark += ", antialiased: a viewer has to be told, as the format cannot"
+        _print_written(path, field, remark)
 
 
 def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> None:
@@ -164,6 +170,7 @@ def _write_one(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
 
 def _write_page(archive: RunArchive, settings: ExportSettings, folder: Path, level: int, field: GaussianField) -> None:
     """Write the page of a field, with the coarser levels of the run that it shows before the field has arrived."""
+    from lapgs_plugin.rasterizers.choice import is_antialiased
     from lapgs_plugin.reference_raster.layout import NEAR_DEPTH
     from lapgs_plugin.rendering.run import run_cameras
     from lapgs_plugin.reports.splat_page import shown_first, write_splat_page
@@ -183,7 +190,15 @@ def _write_page(archive: RunArchive, settings: ExportSettings, folder: Path, lev
     path = folder / (PAGE if settings.level is None else f"{_level_name(archive, settings.level)}.html")
     scene = archive.manifest.scene
     levels = [fields[number] for number in (*first, level)]
-    write_splat_page(levels, path, archive.name, cameras, scene.background, NEAR_DEPTH * scene.unit)
+    write_splat_page(
+        levels,
+        path,
+        archive.name,
+        cameras,
+        scene.background,
+        NEAR_DEPTH * scene.unit,
+        antialiased=is_antialiased(archive.manifest) and not settings.merge,
+    )
     before = "".join(f"after level {number}, " for number in first)
     _print_written(path, levels[-1], f", {before}opens in a browser without a network")
 
@@ -193,19 +208,23 @@ def _write_lod(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
     from lapgs_plugin.errors import require_extra
     from lapgs_plugin.fields.sog import LOD_META, save_streamed_sog
     from lapgs_plugin.files import one_line_errors
+    from lapgs_plugin.rasterizers.choice import is_antialiased
 
     require_extra("zstandard", "spz", "--lod")
     fields = _levels_of_detail(archive, settings)
+    antialiased = set(fields) if is_antialiased(archive.manifest) else set()
+    if settings.merge:
+        antialiased -= {0}  # the merged field is fitted without
     _make(folder)
     with one_line_errors(folder):
-        save_streamed_sog(fields, folder)
+        save_streamed_sog(fields, folder, antialiased=antialiased)
     size = sum(path.stat().st_size for path in folder.glob("*/*"))
     counts = ", ".join(f"{len(field):,}" for _, field in sorted(fields.items()))
     say(f"{folder / LOD_META}: levels of {counts} Gaussians, {size / 1e6:.1f} MB, streamed SOG")
     for level, field in sorted(fields.items()):
         for file_format in (SPZ_4, GLB):
             path = folder / f"level_{level}{SUFFIXES[file_format]}"
-            _write_field(field, path, f"level {level} of {archive.name}", file_format)
+            _write_field(field, path, f"level {level} of {archive.name}", file_format, level in antialiased)
             _print_written(path, field)
 
 
@@ -288,15 +307,15 @@ def _cleaned(
     return {level: levels[level].field for level in fields}
 
 
-def _write_field(field: GaussianField, path: Path, note: str, file_format: str) -> None:
-    """Write a field as a file of a format."""
+def _write_field(field: GaussianField, path: Path, note: str, file_format: str, antialiased: bool = False) -> None:
+    """Write a field as a file of a format. SPZ alone says whether it was trained with antialiasing."""
     from lapgs_plugin.fields.gltf import save_glb
     from lapgs_plugin.fields.spz import save_spz
     from lapgs_plugin.files import one_line_errors
 
     with one_line_errors(path):
         if file_format in (SPZ, SPZ_4):
-            save_spz(field, path, note, 4 if file_format == SPZ_4 else 3)
+            save_spz(field, path, note, 4 if file_format == SPZ_4 else 3, antialiased=antialiased)
         elif file_format == GLB:
             save_glb(field, path, note)
         else:

@@ -89,8 +89,9 @@ class RenderSettings:
                 {"--views": self.views, "--compare": self.compare}, "does not go with --trajectory, which has no photos"
             )
         if self.fps:
+            chosen = None if self.image_format == PNG else self.image_format
             refuse(
-                {"--trajectory": self.trajectory, "--out": self.out, "--compare": self.compare},
+                {"--trajectory": self.trajectory, "--out": self.out, "--compare": self.compare, "--format": chosen},
                 "does not go with --fps",
             )
 

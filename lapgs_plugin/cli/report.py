@@ -113,5 +113,8 @@ def _print(runs: Sequence[MeasuredRun]) -> None:
     console.print(table)
     for line in missing_lines({name: why for run in runs for name, why in run.metrics["lpips_missing"].items()}):
         console.print(f"{line}; then repeat lapgs eval", markup=False, soft_wrap=True)
-    if len(runs) > 1 and (differences := setup_differences(runs[0].archive.manifest, runs[1].archive.manifest)):
-        console.print(f"[yellow]not trained alike:[/yellow] {escape('; '.join(differences))}")
+    if len(runs) < 2:
+        return
+    ours, theirs = (run.archive.manifest for run in runs)
+    if differences := setup_differences(ours, theirs, [run.metrics for run in runs]):
+        console.print(f"[yellow]not trained and measured alike:[/yellow] {escape('; '.join(differences))}")

@@ -10,8 +10,8 @@ Its keys, with levels as text as JSON requires:
     masked: whether pixels outside of masks were left out.
     exposure_compensated: whether the run learned colour transforms of its photos, so that its renders have their mean
         exposure.
-    exposure_predicted: whether they were measured with the exposure that neighbouring photos predict, see
-        `predicted_exposures`.
+    exposure_predicted: whether held-out views were measured with the exposure that neighbouring photos predict, see
+        `predicted_exposures`. Training views are measured with their own.
     train_seconds and other figures of training: see `training_figures`.
     levels: by level, the figures of `OF_LEVELS` and two means over the views: psnr of I_hat^l against level l of the
         photo's Gaussian pyramid, both at the level's size; and upsampled_psnr of I_hat^l upsampled to full resolution
@@ -95,7 +95,9 @@ def evaluate_run(
             split, photos = "other", tuple(sorted((*scene.train, *scene.test), key=lambda view: view.name))
         smallest = min(min(view.camera.size) for view in photos)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
-        looks = photo_looks(archive, [view.name for view in photos])
+        names = [view.name for view in photos]
+        # What the run learned of a photo says nothing about one of the same name in another scene.
+        looks = dict.fromkeys(names, AS_RENDERED) if split == "other" else photo_looks(archive, names)
         with item_progress("views") as progress:
             measured = [
                 _measure_view(view, renderer.render(view.camera), renderer, distances, looks[view.name])
@@ -125,7 +127,7 @@ def evaluate_run(
         "fps": speed.fps,
         "masked": any(view.masked for view in photos),
         "exposure_compensated": archive.exposure(archive.available_levels[-1]) is not None,
-        "exposure_predicted": any(look.exposure is not None for look in looks.values()),
+        "exposure_predicted": split == "test" and any(look.exposure is not None for look in looks.values()),
     }
     archive.write_metrics(metrics)
     return metrics
@@ -187,6 +189,10 @@ class PhotoLook:
         """Return a rendered image (3, h, w) as it is photographed."""
         image = vignette(image, [self.falloff])
         return image if self.exposure is None else transform_colors(image, self.exposure.to(image))
+
+
+AS_RENDERED = PhotoLook(0.0, None)
+"""The look of photos of which a run knows nothing."""
 
 
 def photo_looks(archive: RunArchive, views: Iterable[str]) -> dict[str, PhotoLook]:

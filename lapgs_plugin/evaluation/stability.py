@@ -191,7 +191,7 @@ def evaluate_stability(
 
     Raises:
         RunFolderError: the run is not complete.
-        UserInputError: `single` has several levels, or the path has one frame.
+        UserInputError: `single` has several levels, the path has one frame, or its frames show nothing in common.
     """
     require_complete(archive)
     if single is not None and single.manifest.levels != 1:
@@ -207,6 +207,11 @@ def evaluate_stability(
         frames = path_frames(renderer, other, cameras)
         tracked = progress.track(frames, total=len(cameras), description=f"Following {path}")
         flicker, compared = measure_flicker(tracked)
+    if compared == 0.0:  # its figures would be those of a perfect run
+        raise UserInputError(
+            f"--trajectory {path}: no two frames after each other show the same surface, expected a path in small "
+            "steps; give more --frames, or another path"
+        )
     figures = {
         "path": path,
         "size": [cameras[0].width, cameras[0].height],

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -52,12 +52,13 @@ NOT_ZERO = (0.0, 0.0, 0.0, 1e-100)
 """Added to a quaternion xyzw, so that one of zeros has a direction."""
 
 
-def save_sog(gaussians: GaussianField, folder: Path) -> None:
+def save_sog(gaussians: GaussianField, folder: Path, *, antialiased: bool = False) -> None:
     """Write a field in its own order into a folder: meta.json, and the images that it names.
 
     Args:
         gaussians: one or more, of any SH degree up to 3.
         folder: is made.
+        antialiased: tell viewers to dim Gaussians that are smaller than a pixel.
 
     Raises:
         FieldError: a number is NaN or inf.
@@ -80,6 +81,7 @@ def save_sog(gaussians: GaussianField, folder: Path) -> None:
         "version": 2,
         "asset": {"generator": "lapgs_plugin"},
         "count": len(gaussians),
+        "antialias": antialiased,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_codes, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -100,17 +102,19 @@ def save_sog(gaussians: GaussianField, folder: Path) -> None:
     _save_json(meta, folder / META)
 
 
-def save_streamed_sog(levels: Mapping[int, GaussianField], folder: Path) -> None:
+def save_streamed_sog(levels: Mapping[int, GaussianField], folder: Path, *, antialiased: Collection[int] = ()) -> None:
     """Write levels of detail into a folder: lod-meta.json, and folders of SOG that it names.
 
     Args:
         levels: of one scene; their order is that of detail, the finest first, whatever their numbers.
         folder: is made. Files of an earlier export are replaced, or no longer named.
+        antialiased: the levels that viewers are told to dim, see `save_sog`.
 
     Raises:
         As `save_sog`.
     """
-    fields = [levels[level].detach().to("cpu", torch.float32) for level in sorted(levels)]
+    numbers = sorted(levels)
+    fields = [levels[number].detach().to("cpu", torch.float32) for number in numbers]
     for one in fields:
         one.require_finite()
     layout = _Layout(fields)
@@ -128,7 +132,8 @@ def save_streamed_sog(levels: Mapping[int, GaussianField], folder: Path) -> None
     (folder / LOD_META).unlink(missing_ok=True)  # until all that it names is there
     with item_progress("files") as progress:
         for name, (level, leaves) in progress.track(layout.files.items(), description="Compressing levels"):
-            save_sog(fields[level].kept(torch.from_numpy(np.concatenate(leaves))), folder / name)
+            part = fields[level].kept(torch.from_numpy(np.concatenate(leaves)))
+            save_sog(part, folder / name, antialiased=numbers[level] in antialiased)
     _save_json(meta, folder / LOD_META)
 
 

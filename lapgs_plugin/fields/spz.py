@@ -28,13 +28,15 @@ POSITION_BITS, MOST_FRACTIONAL_BITS = 24, 20
 SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0
 ROTATION_BITS = 9  # of the magnitude of a component; one more is its sign
 GZIP_WITH_COMMENT = 0x10
+ANTIALIASED = 0x1
+"""Flag of fields that were trained with antialiasing."""
 HEADER_4 = struct.Struct("<IIIBBBBI12x")
 ZSTD_LEVEL = 12
 
 Bytes = NDArray[np.uint8]
 
 
-def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3) -> None:
+def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3, *, antialiased: bool = False) -> None:
     """Write a field, completely or not at all.
 
     Positions are rounded to 2^-20 of a world unit or to the resolution that 24 bits allow, standard deviations to 6 %,
@@ -47,6 +49,7 @@ def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3) -
         path: of the file.
         comment: Latin-1 text for the gzip header, which viewers ignore. Version 4 has no place for it.
         version: 3 or 4.
+        antialiased: tell viewers to dim Gaussians that are smaller than a pixel.
 
     Raises:
         MissingExtraError: version 4 needs the extra "spz".
@@ -66,22 +69,23 @@ def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3) -
         _rotations(field),
         _higher_coefficients(field),
     )
-    streams, facts = [array.tobytes() for array in arrays], (len(field), field.sh_degree, fractional_bits)
+    streams = [array.tobytes() for array in arrays]
+    facts = len(field), field.sh_degree, fractional_bits, ANTIALIASED if antialiased else 0
     with atomic_write(path) as stream:
         if version == 3:
-            header = struct.pack("<IIIBBBB", MAGIC, 3, *facts, 0, 0)
+            header = struct.pack("<IIIBBBB", MAGIC, 3, *facts, 0)
             stream.write(_gzip(b"".join([header, *streams]), comment))
         else:
             stream.write(_with_table(facts, [content for content in streams if content]))
 
 
-def _with_table(facts: tuple[int, int, int], streams: list[bytes]) -> bytes:
-    """Return a file of version 4: `facts` are the number of Gaussians, the SH degree and the fractional bits."""
+def _with_table(facts: tuple[int, int, int, int], streams: list[bytes]) -> bytes:
+    """Return a file of version 4: `facts` are the number of Gaussians, the SH degree, fractional bits and flags."""
     import zstandard
 
     compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
     frames = [compressor.compress(content) for content in streams]
-    header = HEADER_4.pack(MAGIC, 4, *facts, 0, len(frames), HEADER_4.size)
+    header = HEADER_4.pack(MAGIC, 4, *facts, len(frames), HEADER_4.size)
     table = [struct.pack("<QQ", len(frame), len(content)) for frame, content in zip(frames, streams, strict=True)]
     return b"".join([header, *table, *frames])
 

@@ -90,6 +90,11 @@ def _raster_settings(manifest: Manifest) -> dict[str, Any]:
     return along_rays | {name: value for name, value in recorded.items() if value != CONSTANTS.get(name)}
 
 
+def is_antialiased(manifest: Manifest) -> bool:
+    """Return whether a run's rasterizer dims Gaussians that are smaller than a pixel."""
+    return bool(_raster_settings(manifest).get("antialiasing", False))
+
+
 def _most_similar(trained: str, device: str, settings: Mapping[str, Any]) -> tuple[PlacedRasterizer, str]:
     """Return the available rasterizer that is most similar to that of the training, and the reason."""
     on_gpu, obstacle = device != "cpu" and torch.cuda.is_available(), ""

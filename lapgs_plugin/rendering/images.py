@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain, count
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -78,11 +79,17 @@ def caption_height(height: int) -> int:
 def file_stems(views: Sequence[View]) -> dict[str, str]:
     """Return the file stem of each view: its name without extension, unless two views would share that.
 
-    Folders in a name are kept, except steps upwards, so that no file is written outside the output folder.
+    Folders in a name are kept, except steps upwards, so that no file is written outside the output folder. A number is
+    added where even whole names would share a file.
     """
     names = [view.name for view in views]
     paths = {name: PurePosixPath(*(p for p in PurePosixPath(name).parts if p not in ("/", ".."))) for name in names}
     users = Counter(path.with_suffix("") for path in paths.values())
-    return {
-        name: str(path.with_suffix("") if users[path.with_suffix("")] == 1 else path) for name, path in paths.items()
-    }
+    stems: dict[str, str] = {}
+    taken: set[str] = set()
+    for name, path in paths.items():
+        short = [str(path.with_suffix(""))] if users[path.with_suffix("")] == 1 else []
+        numbered = (f"{path}_{number}" for number in count(2))
+        stems[name] = next(stem for stem in chain(short, [str(path)], numbered) if stem not in taken)
+        taken.add(stems[name])
+    return stems

@@ -85,7 +85,7 @@ def run_scene(archive: RunArchive, moved_to: Path | None = None) -> Scene:
         scene = load_reference(replace(reference, path=str(path)), hold=False)
     require_same_scene(archive, scene.path, scene.smallest_size)
     views = {view.name: view for view in (*scene.train, *scene.test)}
-    cameras = (refined(archive, each) for each in _as_trained(archive, *map(_by_name, (scene.train, scene.test))))
+    cameras = _as_rendered(archive, moved_to, _by_name(scene.train), _by_name(scene.test))
     train, test = (tuple(views[name].at(camera) for name, camera in each.items()) for each in cameras)
     return replace(scene, train=train, test=test)
 
@@ -101,11 +101,14 @@ def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
         trained, held_out = run_cameras(archive)
     except (RunFolderError, SceneError):
         return False  # it was moved, and `scene` is where it is now
-    own = {**trained, **held_out}
-    views = (*scene.train, *scene.test)
+    return _have_nothing_in_common({**trained, **held_out}, _by_name((*scene.train, *scene.test)))
+
+
+def _have_nothing_in_common(own: Mapping[str, Camera], others: Mapping[str, Camera]) -> bool:
+    """Return whether no view is in both by its name and its pose."""
     return not any(
-        view.name in own and torch.allclose(own[view.name].world_to_camera, view.camera.world_to_camera)
-        for view in views
+        name in own and torch.allclose(own[name].world_to_camera, camera.world_to_camera)
+        for name, camera in others.items()
     )
 
 
@@ -117,16 +120,47 @@ def run_cameras(archive: RunArchive, moved_to: Path | None = None) -> tuple[dict
     """
     reference, path = _scene_folder(archive, moved_to)
     with _errors_about_scene(archive, moved_to):
-        train, test = load_cameras(
-            path,
-            resolution=reference.resolution,
-            images=reference.images,
-            eval=reference.eval,
-            distorted=reference.distorted,
-        )
+        train, test = _scene_cameras(reference, path)
     require_same_scene(archive, path, smallest_of([*train.values(), *test.values()]))
+    return _as_rendered(archive, moved_to, train, test)
+
+
+def _scene_cameras(reference: SceneReference, path: Path) -> tuple[dict[str, Camera], dict[str, Camera]]:
+    """Load the training and held-out cameras by view name as a scene's files have them."""
+    return load_cameras(
+        path,
+        resolution=reference.resolution,
+        images=reference.images,
+        eval=reference.eval,
+        distorted=reference.distorted,
+    )
+
+
+def _as_rendered(
+    archive: RunArchive, moved_to: Path | None, train: Mapping[str, Camera], test: Mapping[str, Camera]
+) -> tuple[dict[str, Camera], dict[str, Camera]]:
+    """Return the cameras of a scene's files by view name as the run has them: its script's, and `refined`.
+
+    Photos of another scene keep their cameras. What the run learned of a photo says nothing about one of the same name.
+
+    Raises:
+        RunFolderError: as `_as_trained` and `refined`.
+    """
+    if moved_to is not None and _is_of_others(archive.manifest.scene, {**train, **test}):
+        return dict(train), dict(test)
     train, test = _as_trained(archive, train, test)
     return refined(archive, train), refined(archive, test)
+
+
+def _is_of_others(reference: SceneReference, cameras: Mapping[str, Camera]) -> bool:
+    """Return whether cameras, as files have them, are none of the scene of a run; False if that is missing now."""
+    if not is_folder(Path(reference.path)):
+        return False
+    try:
+        trained, held_out = _scene_cameras(reference, Path(reference.path))
+    except SceneError:
+        return False
+    return _have_nothing_in_common({**trained, **held_out}, cameras)
 
 
 def _by_name(views: Sequence[View]) -> dict[str, Camera]:

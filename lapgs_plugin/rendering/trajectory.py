@@ -91,8 +91,10 @@ def walking_order(cameras: Sequence[Camera]) -> list[Camera]:
 
     The order of a video, and usually of photos, is how somebody walked.
     """
+    from scipy.spatial.distance import cdist  # as for `spline`
+
     positions = camera_positions(cameras)
-    distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)  # (n, n)
+    distances = cdist(positions, positions)  # (n, n)
     tour = _short_tour(distances)
     as_given = float(np.diagonal(distances, 1).sum())
     jumps = as_given > JUMPING * float(distances[tour[:-1], tour[1:]].sum())
@@ -160,11 +162,11 @@ def with_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 def _short_tour(distances: NDArray[np.float64]) -> list[int]:
     """Return indices of all points in the order of a short tour from the first: nearest neighbour, then 2-opt."""
-    tour, left = [0], set(range(1, len(distances)))
-    while left:
-        tour.append(min(left, key=lambda i: (distances[tour[-1], i], i)))
-        left.remove(tour[-1])
-    improved = True
+    tour, passed = [0], np.zeros(len(distances), bool)
+    for _ in range(1, len(distances)):
+        passed[tour[-1]] = True
+        tour.append(int(np.where(passed, np.inf, distances[tour[-1]]).argmin()))
+    least_gain, improved = 1e-9 * distances.max(), True
     while improved:
         improved = False
         for i in range(len(tour) - 2):
@@ -174,7 +176,7 @@ def _short_tour(distances: NDArray[np.float64]) -> list[int]:
             gain = here[tour[i + 1]] - here[ends]
             gain[:-1] += distances[ends[:-1], beyond[:-1]] - after[beyond[:-1]]
             best = int(gain.argmax())
-            if gain[best] > 1e-9 * distances.max():
+            if gain[best] > least_gain:
                 tour[i + 1 : i + 3 + best] = tour[i + 1 : i + 3 + best][::-1]
                 improved = True
     return tour

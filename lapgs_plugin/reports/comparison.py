@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from lapgs_plugin.evaluation.lpips import lpips_titles
+from lapgs_plugin.evaluation.lpips import LPIPS_KEY, lpips_titles
 from lapgs_plugin.runs.manifest import Manifest
 from lapgs_plugin.runs.results import MEASURED
 
@@ -51,8 +51,12 @@ class Row:
 
 
 def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
-    """Return the rows for the metrics of a run, and then of its baseline if there is one."""
-    views = MEASURED[metrics[0]["split"]]
+    """Return the rows for the metrics of a run, and then of its baseline if there is one.
+
+    Quality is only compared between views of one kind: a baseline's of other views says of which it is.
+    """
+    splits = [run["split"] for run in metrics]
+    views = MEASURED[splits[0]]
     table: tuple[tuple[str, str, str, Callable[[float, float], str]], ...] = (
         ("psnr", f"PSNR, {views} views (dB)", "{:.2f}", _difference("{:+.2f} dB")),
         ("ssim", f"SSIM, {views} views", "{:.4f}", _difference("{:+.4f}")),
@@ -74,16 +78,24 @@ def comparison_rows(metrics: Sequence[Metrics]) -> tuple[Row, ...]:
     rows = []
     for key, label, pattern, compare in table:
         scale = 1e-9 if key.endswith("_bytes") else 1.0
+        alike = not _is_quality(key) or len(set(splits)) == 1
         cells = tuple(
             # A user's own loop that measures no time records 0 seconds.
             _cell(run.get(key) or None if key == "train_seconds" else run.get(key), pattern, scale)
             for run in metrics
         )
+        if not alike and cells[1].value is not None:
+            cells = cells[0], replace(cells[1], text=f"{cells[1].text} ({MEASURED[splits[1]]})")
         values = [cell.value for cell in cells if cell.value is not None]
         if not values and key in OPTIONAL_ROWS:
             continue
-        rows.append(Row(key, label, cells, compare(*values) if len(values) == 2 else ""))
+        rows.append(Row(key, label, cells, compare(*values) if alike and len(values) == 2 else ""))
     return tuple(rows)
+
+
+def _is_quality(key: str) -> bool:
+    """Return whether a row is a figure of measured views."""
+    return key in ("psnr", "ssim") or key.startswith(LPIPS_KEY.format(""))
 
 
 def _cell(value: float | dict[str, float] | None, pattern: str, scale: float) -> Cell:
@@ -110,16 +122,19 @@ def _ratio(run: float, baseline: float) -> str:
     return f"{run / baseline:.2f}x" if baseline else ""
 
 
-def setup_differences(run: Manifest, baseline: Manifest) -> list[str]:
-    """Describe the differences in setup that make a comparison of two runs unfair."""
+def setup_differences(run: Manifest, baseline: Manifest, metrics: Sequence[Metrics]) -> list[str]:
+    """Describe the differences in setup that make a comparison of two runs unfair; `metrics` are theirs."""
     pairs = {
         "scene": (run.scene.path, baseline.scene.path),
         "images": (run.scene.images, baseline.scene.images),
         "resolution": (run.scene.resolution, baseline.scene.resolution),
+        "masks": (run.scene.masks, baseline.scene.masks),
+        "masks of the sky": (run.scene.sky, baseline.scene.sky),
         "held-out views": (run.scene.eval, baseline.scene.eval),
         "background": (run.scene.background, baseline.scene.background),
         "rasterizer": (run.rasterizer, baseline.rasterizer),
         "iterations": (run.settings.get("iterations"), baseline.settings.get("iterations")),
         "SH degree": (run.sh_degree, baseline.sh_degree),
+        "measured views": tuple(MEASURED[figures["split"]] for figures in metrics),
     }
     return [f"{name} {ours} against {theirs}" for name, (ours, theirs) in pairs.items() if ours != theirs]

@@ -105,7 +105,9 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         metrics=run.metrics,
         measured=MEASURED[run.metrics["split"]],
         baseline_name=baseline.name if baseline else None,
-        differences=setup_differences(run.archive.manifest, baseline.archive.manifest) if baseline else [],
+        differences=setup_differences(run.archive.manifest, baseline.archive.manifest, [one.metrics for one in runs])
+        if baseline
+        else [],
         rows=comparison_rows([measured.metrics for measured in runs]),
         charts=training_charts(runs, kinds, marked=True),
         arrows=_time_arrows(run, baseline) if baseline else None,

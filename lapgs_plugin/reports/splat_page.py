@@ -59,6 +59,8 @@ def write_splat_page(
     cameras: Sequence[Camera],
     background: tuple[float, float, float],
     near: float = NEAR_DEPTH,
+    *,
+    antialiased: bool = False,
 ) -> None:
     """Write the page.
 
@@ -69,6 +71,7 @@ def write_splat_page(
         cameras: of the training views; the page starts at the first and turns around the point that all look at.
         background: RGB in [0, 1] behind the Gaussians.
         near: least depth of Gaussians that are drawn, in world units.
+        antialiased: dim Gaussians that are smaller than a pixel.
 
     Raises:
         FieldError: a field is a residual, or holds NaN or inf.
@@ -76,7 +79,8 @@ def write_splat_page(
     """
     levels = [pack_level(field, shaded=field is fields[-1]) for field in fields]
     parts = [base64.b64encode(part).decode() for level in levels for part in level.parts]
-    start = {**_start(cameras), "background": background, "near": near, "levels": [level.header for level in levels]}
+    start = {**_start(cameras), "background": background, "near": near, "antialiased": antialiased}
+    start["levels"] = [level.header for level in levels]
     # Base64 and our own JSON of numbers hold nothing to escape.
     values = {"title": title, "start": Markup(json.dumps(start)), "parts": [Markup(part) for part in parts]}
     write_text(path, render_page(TEMPLATE, characters=sum(map(len, parts)), **values))

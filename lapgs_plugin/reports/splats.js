@@ -9,6 +9,7 @@ const COLUMNS = 64;  // sets of coefficients in a row of their texture
 const BUCKETS = 65536;
 const START = JSON.parse(document.getElementById("start").textContent);
 const NEAR = START.near;  // the least depth that is drawn
+const ANTIALIASED = Boolean(START.antialiased);  // whether Gaussians that are smaller than a pixel are dimmed
 
 const HEAD = `#version 300 es
 precision highp float;
@@ -66,6 +67,11 @@ void main() {
   vec3 across = focal / center.z * (vec3(axes[0].x, axes[1].x, axes[2].x) - slope.x * vec3(axes[0].z, axes[1].z, axes[2].z));
   vec3 along = focal / center.z * (vec3(axes[0].y, axes[1].y, axes[2].y) - slope.y * vec3(axes[0].z, axes[1].z, axes[2].z));
   float a = dot(across, across) + 0.3, b = dot(across, along), c = dot(along, along) + 0.3;
+  if (${ANTIALIASED}) {  // the lower bound is that of 3DGS
+    vec3 spanned = cross(across, along);  // its square is the determinant before the blur
+    color.a *= sqrt(max(0.000025, dot(spanned, spanned) / (a * c - b * b)));
+    if (color.a * 255.0 <= 1.0) return;
+  }
   float middle = 0.5 * (a + c), radius = length(vec2(0.5 * (a - c), b));
   vec2 variance = vec2(middle + radius, max(middle - radius, 0.1));
   vec2 major = abs(b) > 1e-6 ? normalize(vec2(b, variance.x - a)) : (a >= c ? vec2(1, 0) : vec2(0, 1));

@@ -20,7 +20,6 @@ from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.ops.vignetting import vignette
 from lapgs_plugin.progress import item_progress
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
-from lapgs_plugin.rasterizers.gsplat import rasterizer as gsplat
 from lapgs_plugin.registry import NONE
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
@@ -91,7 +90,7 @@ def merge_levels(
         teacher = _composed(renderer, scene)
         start = first_field(fields)
         name = choose_rasterizer(AUTO)
-        settings = _settings(manifest, start.sh_degree, iterations, on_gsplat=name == gsplat.NAME)
+        settings = _settings(manifest, start.sh_degree, iterations)
         reference = replace(manifest.scene, eval=True, distorted=False)  # other programs render pinholes
         placed = training_rasterizer(name, settings)
         empty = Manifest(reference, rasterizer=placed.rasterizer.name, **settings.for_manifest())
@@ -136,7 +135,8 @@ def _padded(sh: torch.Tensor, count: int) -> torch.Tensor:
     return torch.cat([sh, sh.new_zeros(len(sh), count - sh.shape[1], 3)], dim=1)
 
 
-def _settings(manifest: Manifest, sh_degree: int, iterations: int, on_gsplat: bool) -> TrainSettings:
+def _settings(manifest: Manifest, sh_degree: int, iterations: int) -> TrainSettings:
+    """Return the settings of the fit: without antialiasing, of which most viewers and a PLY file know nothing."""
     return TrainSettings(
         iterations=iterations,
         levels=1,
@@ -147,7 +147,6 @@ def _settings(manifest: Manifest, sh_degree: int, iterations: int, on_gsplat: bo
         seed=manifest.seed,
         learning_rates=LearningRates(means_first=MEANS_RATE),
         densification=Densification(until=0, reset_every=0, strategy=GRADIENTS),  # the field stays as it is
-        antialiased=on_gsplat and bool(manifest.settings.get("antialiased", False)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -52,6 +53,35 @@ def test_a_run_with_residuals_has_the_merged_field_and_the_base(tmp_path: Path) 
     assert "merged field:" in lapgs_export(run, "--lod", "--merge", "--iterations", 2)
     meta, _ = read_levels(run / "export" / "lod")
     assert meta["counts"] == [450, 250]
+
+
+def antialias(run: Path) -> None:
+    """Make a run one that gsplat trained with antialiasing."""
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["settings"] |= {"antialiased": True, "raster": {"antialiasing": True}}
+    (run / "manifest.json").write_text(json.dumps(manifest | {"rasterizer": "gsplat"}))
+
+
+def antialiased_files(folder: Path) -> list[bool]:
+    """Return what the files of streamed SOG say, by level."""
+    names = json.loads((folder / "lod-meta.json").read_text())["filenames"]
+    return [json.loads((folder / name).read_text())["antialias"] for name in sorted(names)]
+
+
+def test_files_say_that_a_run_was_trained_with_antialiasing(nested: Path, tmp_path: Path) -> None:
+    lapgs_export(nested, "--lod")
+    assert antialiased_files(nested / "export" / "lod") == [False, False]
+    antialias(nested)
+    lapgs_export(nested, "--lod")
+    assert antialiased_files(nested / "export" / "lod") == [True, True]
+    for file_format in ("spz", "spz4"):
+        lapgs_export(nested, "--format", file_format)
+        assert len(read_spz(nested / "export" / "level_0_field.spz", antialiased=True)[0]) == 200
+    assert "antialiased: a viewer has to be told" in lapgs_export(nested, "--format", "ply")
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "other"))
+    antialias(run)
+    lapgs_export(run, "--lod", "--merge", "--iterations", 2)
+    assert antialiased_files(run / "export" / "lod") == [False, True]  # the merged field is fitted without
 
 
 def test_levels_of_detail_are_cropped(nested: Path) -> None:

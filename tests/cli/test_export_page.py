@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
 import zlib
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,7 @@ from lapgs_plugin.errors import FieldError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
-from lapgs_plugin.reference_raster import CpuRasterizer
+from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer
 from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.reports import splat_page
 from lapgs_plugin.reports.splat_page import shown_first, write_splat_page
@@ -240,6 +241,41 @@ def test_a_phone_shows_what_was_photographed_and_how_to_touch_it(run: Path, phon
     page.evaluate("again.hidden = true")
     page.wait_for_timeout(100)
     assert np.array_equal(_picture(page), first)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_page_of_an_antialiased_run_dims_small_gaussians(phone: Any, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), nested=True)
+    camera = next(iter(run_cameras(RunArchive.open(run))[0].values()))
+    enlarged = camera.resized(round(WIDTH * PHONE[1] / HEIGHT), PHONE[1])
+    small = blob_field(200)
+    half_a_pixel = 0.5 * float(camera.position.norm()) / enlarged.fy
+    small = small.with_parameters(
+        {
+            "means": 0.1 * small.means,  # so many in a few pixels
+            "log_scales": torch.full_like(small.log_scales, math.log(half_a_pixel)),
+            "opacity_logits": torch.full_like(small.opacity_logits, 3.0),
+        }
+    )
+    small.save_ply(RunArchive.open(run).field_path(0))
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["settings"] |= {"antialiased": True, "raster": {"antialiasing": True}}
+    (run / "manifest.json").write_text(json.dumps(manifest | {"rasterizer": "gsplat"}))
+    lapgs_export(run, "--html")
+    left = (enlarged.width - PHONE[0]) // 2
+    page = phone.new_page()
+    page.goto((run / "export" / "scene.html").as_uri())
+    page.wait_for_selector("canvas[data-complete][data-shown]", state="attached")
+    page.keyboard.press("h")
+    shown, background = _tensor(_picture(page)), torch.tensor(BACKGROUND)
+    dimmed, plain = (
+        OracleRasterizer(antialiasing=antialiasing).render_image(small, enlarged, background=background)
+        for antialiasing in (True, False)
+    )
+    there = dimmed[..., left : left + PHONE[0]], plain[..., left : left + PHONE[0]]
+    assert psnr(shown, there[0]) > 52  # 55.9 seen: colours have 8 bits
+    assert psnr(shown, there[1]) < 46  # 43.6 seen
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,18 @@ from lapgs_plugin.cli.render import render
 from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
 from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
-from lapgs_plugin.rendering.images import caption_height
+from lapgs_plugin.rendering.images import caption_height, file_stems
+from lapgs_plugin.rendering.run import run_cameras
 from lapgs_plugin.reports.comparison import comparison_rows
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import EXPOSURE, POSES
 from lapgs_plugin.scenes.images import read_image
+from lapgs_plugin.scenes.scene import View, load_cameras
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import SECONDS, write_run, write_scene
 from tests.folders import files_in
 from tests.refusals import refuses
+from tests.training_scene import HEIGHT, WIDTH, ring_camera
 
 app = typer.Typer()
 app.command("render")(render)
@@ -115,6 +119,14 @@ def test_view_names_that_would_share_a_file_keep_their_extension(tmp_path: Path)
     written = files_in(run / "renders" / "train")
     assert {"a/1.png_composed.png", "a/1.tif_composed.png", "b/0_composed.png"} <= written
     assert len(written) == 10
+
+
+@pytest.mark.parametrize("names", [["1.png", "1.tif", "1.png.tif"], ["../1.png", "1.png"], ["a/../1.png", "a/1.png"]])
+def test_no_two_views_share_a_file(names: list[str]) -> None:
+    camera, image = ring_camera(0.0), torch.zeros(3, HEIGHT, WIDTH)
+    stems = file_stems([View(name, camera, image) for name in names])
+    assert len(set(stems.values())) == len(stems) == len(names)
+    assert not any(".." in Path(stem).parts or Path(stem).is_absolute() for stem in stems.values())
 
 
 def test_eval_agrees_with_numpy_on_the_rendered_files(run: Path, scene: Path) -> None:
@@ -224,6 +236,60 @@ def test_eval_says_that_views_are_of_another_scene(hold_out: bool, scene: Path, 
     assert json.loads((run / "metrics.json").read_text())["split"] == ("test" if hold_out else "train")
 
 
+def test_what_a_run_learned_of_its_photos_is_not_used_for_photos_of_the_same_name(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    others = write_scene(tmp_path / "others", [f"photos/{i:02d}.png" for i in range(1, 10)])  # at other poses
+    lapgs("eval", run, "--scene", others)
+    before = json.loads((run / "metrics.json").read_text())
+    names = [f"photos/{i:02d}.png" for i in range(10) if i not in (0, 8)]
+    (run / "level_0" / EXPOSURE).write_text(json.dumps({name: (1.5 * np.eye(3, 4)).tolist() for name in names}))
+    (run / "level_0" / POSES).write_text(json.dumps({name: [0.1, 0.0, 0.0, 0.2, 0.0, 0.0] for name in names}))
+    lapgs("eval", run, "--scene", others)
+    after = json.loads((run / "metrics.json").read_text())
+    assert before["split"] == after["split"] == "other"
+    assert [view["psnr"] for view in after["views"]] == [view["psnr"] for view in before["views"]]
+    ours, theirs = (run_cameras(RunArchive.open(run), folder)[0] for folder in (None, others))
+    plain = load_cameras(others, resolution="full", eval=True)[0]
+    for name, camera in theirs.items():
+        assert torch.equal(camera.world_to_camera, plain[name].world_to_camera)
+    moved = load_cameras(scene, resolution="full", eval=True)[0]["photos/02.png"]
+    assert not torch.equal(ours["photos/02.png"].world_to_camera, moved.world_to_camera)
+
+
+def test_training_views_are_not_said_to_have_the_exposure_of_their_neighbours(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene, hold_out=False)
+    learned = {f"photos/{i:02d}.png": (1.25 * np.eye(3, 4)).tolist() for i in range(10)}
+    (run / "level_0" / EXPOSURE).write_text(json.dumps(learned))
+    assert "exposure of its neighbours" not in " ".join(lapgs("eval", run).split())
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert (metrics["split"], metrics["exposure_compensated"], metrics["exposure_predicted"]) == ("train", True, False)
+
+
+def test_pixels_outside_of_masks_change_no_psnr_of_any_level(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    run = write_run(tmp_path / "run", scene)
+    inside = np.zeros((HEIGHT, WIDTH), np.uint8)
+    inside[5:-9, 7:-15] = 255
+    for photo in sorted((scene / "photos").iterdir()):
+        (scene / "masks" / "photos").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(scene / "masks" / "photos" / photo.name), inside)
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["scene"]["masks"] = "masks"
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    measured = []
+    for outside in (None, 255):
+        for photo in sorted((scene / "photos").iterdir()):
+            image = read_image(photo).numpy().transpose(1, 2, 0)[..., ::-1] * 255
+            image = image if outside is None else np.where(inside[..., None] > 0, image, outside)
+            cv2.imwrite(str(photo), np.rint(image).astype(np.uint8))
+        lapgs("eval", run)
+        metrics = json.loads((run / "metrics.json").read_text())
+        assert metrics["masked"]
+        of_levels = [metrics["levels"][level][key] for level in "10" for key in ("psnr", "upsampled_psnr")]
+        measured.append([metrics["psnr"], metrics["fitted_psnr"], *of_levels])
+    np.testing.assert_allclose(*measured, atol=1e-3)
+
+
 def test_another_scene_is_refused(run: Path, tmp_path: Path) -> None:
     other = write_scene(tmp_path / "other", size=(64, 48))
     with pytest.raises(RunFolderError, match=r"level 1 would be 32x24 pixels, the run was trained at 28x20"):
@@ -283,4 +349,5 @@ def test_frame_rates_are_printed_and_nothing_is_written(run: Path) -> None:
     for words in (("levels 1 to 0, one after the other", "450"), ("base", "250"), ("residual 0 alone", "200")):
         assert any(all(word in line for word in words) for line in printed.splitlines()), words
     assert "100x60" in lapgs("render", run, "--fps", "--size", "100x60")
+    refuses(UserInputError, "--format does not go with --fps", lapgs, "render", run, "--fps", "--format", "exr")
     assert files_in(run) == before

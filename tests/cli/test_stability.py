@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 import typer
 
 from lapgs_plugin.cli.evaluate import evaluate
@@ -47,6 +49,16 @@ def test_an_orbit_shows_flicker(scene: Path, tmp_path: Path) -> None:
     assert list(figures["flicker"]) == ["composition", "band 1", "band 0"]
     assert 0 < figures["compared"] < 1
     assert figures["flicker"]["composition"]["mean"] > 1e-4
+
+
+def test_a_path_whose_frames_show_nothing_in_common_is_refused(scene: Path, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", scene)
+    camera = next(iter(run_cameras(RunArchive.open(run))[0].values()))
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # by 180 degrees about the vertical
+    away = replace(camera, world_to_camera=turn @ camera.world_to_camera)
+    (tmp_path / "jump.json").write_text(json.dumps(trajectory_json([camera, away])))
+    refuses(UserInputError, "no two frames .* --frames", lapgs_eval, run, "--trajectory", tmp_path / "jump.json")
+    assert not (run / "stability.json").exists()
 
 
 def test_contradicting_options_are_refused(scene: Path, tmp_path: Path) -> None:

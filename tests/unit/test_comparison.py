@@ -101,6 +101,21 @@ def test_a_run_alone_has_one_cell_and_no_change() -> None:
 def test_differences_of_setup_are_listed() -> None:
     scene = SceneReference("/data/fox", "1/4", True, (0.0, 0.0, 0.0), "colmap")
     run = Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, {"iterations": 3000})
-    assert setup_differences(run, replace(run, levels=1, seed=3)) == []
+    both = [metrics(), BASELINE]
+    assert setup_differences(run, replace(run, levels=1, seed=3), both) == []
     other = replace(run, scene=replace(scene, resolution="1/8"), settings={"iterations": 1000})
-    assert setup_differences(run, other) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]
+    assert setup_differences(run, other, both) == ["resolution 1/4 against 1/8", "iterations 3000 against 1000"]
+    masked = replace(run, scene=replace(scene, masks="masks"))
+    assert setup_differences(masked, run, both) == [f"masks masks against {scene.masks}"]
+
+
+@pytest.mark.parametrize(("split", "views"), [("train", "training"), ("other", "another scene's")])
+def test_quality_of_other_views_is_not_compared(split: str, views: str) -> None:
+    both = [metrics(), {**BASELINE, "split": split}]
+    rows = {row.key: row for row in comparison_rows(both)}
+    assert (rows["psnr"].change, rows["ssim"].change) == ("", "")
+    assert rows["psnr"].cells[1].text == f"{BASELINE['psnr']:.2f} ({views})"
+    assert rows["train_seconds"].change == "1.75x as fast"
+    scene = SceneReference("/data/fox", "1/4", True, (0.0, 0.0, 0.0), "colmap")
+    run = Manifest(scene, 2, "camera", "reconstructed", "xyz", 3, "cpu", 0, {"iterations": 3000})
+    assert setup_differences(run, run, both) == [f"measured views held-out against {views}"]

@@ -174,7 +174,7 @@ def test_leaves_are_small_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_an_earlier_export_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_streamed_sog({0: fields(5, 0, 200, 2.0), 1: fields(6, 0, 50, 2.0)}, tmp_path)
-    monkeypatch.setattr(sog, "save_sog", lambda *_: pytest.fail("stopped"))
+    monkeypatch.setattr(sog, "save_sog", lambda *_, **__: pytest.fail("stopped"))
     with pytest.raises(pytest.fail.Exception):
         save_streamed_sog({0: fields(5, 0, 100, 2.0), 1: fields(6, 0, 50, 2.0)}, tmp_path)
     assert not (tmp_path / "lod-meta.json").exists(), "it would name files that are half written"

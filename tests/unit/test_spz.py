@@ -27,11 +27,14 @@ from tests.training_scene import blob_field, ring_camera
 HALF_TURN = Rotation.from_euler("x", 180, degrees=True)  # between y down, z ahead and y up, z back
 
 
-def read_spz(path: Path) -> tuple[GaussianField, int]:
-    """Return the field in the file's axes (y up, z back), and its fractional bits."""
+def read_spz(path: Path, antialiased: bool = False) -> tuple[GaussianField, int]:
+    """Return the field in the file's axes (y up, z back), and its fractional bits; check what it says of its training.
+
+    Bit 0 of the flags is "antialiased" in Niantic's description.
+    """
     data, sizes = stored(path.read_bytes())
     magic, version, count, degree, fractional_bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
-    assert (magic, flags) == (b"NGSP", 0)
+    assert (magic, flags) == (b"NGSP", int(antialiased))
     assert (version, reserved) == ((3, 0) if sizes is None else (4, len(sizes)))
     rest = (degree + 1) ** 2 - 1
     if sizes is not None:

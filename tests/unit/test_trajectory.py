@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,19 @@ def test_cameras_out_of_order_are_walked_past_in_turn() -> None:
     cameras = ring(30, angle=5.0)
     shuffled = [cameras[0], *(cameras[1 + 7 * i % 29] for i in range(29))]
     assert [id(camera) for camera in walking_order(shuffled)] == [id(camera) for camera in cameras]
+
+
+def test_an_order_of_many_cameras_takes_little_more_memory_than_their_distances() -> None:
+    count = 1000
+    cameras = [ring_camera(angle) for angle in np.random.default_rng(0).uniform(0, 6, count)]
+    walking_order(cameras[:3])  # imports what it needs
+    tracemalloc.start()
+    try:
+        walking_order(cameras)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 1.5 * 8 * count**2  # 1.01 seen; differences of all pairs take three times as much
 
 
 def test_cameras_in_order_are_left_alone() -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lapgs_plugin.errors import RunFolderError, TrainingStoppedError
-from lapgs_plugin.evaluation.figures import photo_looks
+from lapgs_plugin.evaluation.figures import PhotoLook, photo_looks
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.ops.mixed_sizes import own_part, stack_padded
 from lapgs_plugin.ops.vignetting import vignette
@@ -171,3 +171,13 @@ def test_damaged_falloffs_are_refused(tmp_path: Path) -> None:
         archive.path(VIGNETTING).write_text(f'{{"view_1.png": {damaged}}}')
         with pytest.raises(RunFolderError, match=r"vignetting\.json.*train again with --overwrite"):
             RunArchive.open(tmp_path / "run").vignetting()
+
+
+def test_a_photo_is_darkened_by_its_lens_before_its_exposure_transforms_it() -> None:
+    image = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
+    exposure = torch.tensor([[1.2, 0.1, 0.0, 0.3], [0.0, 0.9, 0.0, -0.1], [0.05, 0.0, 1.1, 0.2]])
+    darkened = (image * vignette(torch.ones_like(image), [0.8])).double().numpy()
+    expected = (
+        np.einsum("ij,jhw->ihw", exposure[:, :3].double(), darkened) + exposure[:, 3, None, None].double().numpy()
+    )
+    np.testing.assert_allclose(PhotoLook(0.8, exposure).of(image), expected, atol=1e-6)  # 1.7e-7 seen
