@@ -17,6 +17,7 @@ from lapgs_plugin.cli.app import app
 from lapgs_plugin.errors import LapgsError, MissingExtraError, RunFolderError, UserInputError
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.gaussian_field import field_from_splats
+from lapgs_plugin.rasterizers.choice import is_antialiased
 from lapgs_plugin.rasterizers.gsplat.rasterization import refusal
 from lapgs_plugin.reference_raster import gsplat as stand_in
 from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
@@ -120,6 +121,21 @@ def test_the_run_folder_shows_what_the_script_measured(finished: Path) -> None:
     """The script evaluates composed images, and the folder has its cameras: those of a normalised world."""
     own = measured(finished, 29 if finished.name == "nested" else 19)
     assert rendered(finished) == pytest.approx(own, abs=1e-4)  # 5e-7 was seen
+
+
+def test_a_run_is_antialiased_as_its_script(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it is rendered and exported that way. The stand-in cannot, and trains without."""
+    original = stand_in.rasterization
+    modes: list[str] = []
+
+    def classic(*args: Any, rasterize_mode: str, **inputs: Any) -> Any:
+        modes.append(rasterize_mode)
+        return original(*args, **inputs)
+
+    monkeypatch.setattr(stand_in, "rasterization", classic)
+    folder = train(scene, tmp_path, "--antialiased", lapgs=hierarchy("nested"))
+    assert {*modes} == {"antialiased"}
+    assert is_antialiased(RunArchive.open(folder).manifest)
 
 
 def test_the_script_writes_its_results_where_it_does_alone(finished: Path) -> None:

@@ -333,7 +333,7 @@ def _manifest(
         seed=settings.seed,
         settings={
             "backbone": {"name": script.stem, "checkout": str(script.parent), "arguments": sys.argv[1:]},
-            RASTER_SETTINGS: {"antialiased": True} if getattr(config, "antialiased", False) else {},
+            RASTER_SETTINGS: {"antialiasing": True} if getattr(config, "antialiased", False) else {},
             **({} if decision is None else {CHOICE: decision.for_manifest()}),
             "iterations": plan.iterations,
             **settings.for_manifest(),
