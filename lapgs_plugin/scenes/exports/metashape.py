@@ -184,7 +184,7 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
         return number(calibration.findtext(name, "0"), f"{where}: its {name}")
 
     f, b1, b2, p1, p2 = (term(name) for name in ("f", "b1", "b2", "p1", "p2"))
-    if abs(b2) * height > 2.0 * INEXACT * f:  # at the upper border b2 shifts by that times half the height over f
+    if abs(b2) * height > 2.0 * INEXACT * abs(f):  # at the upper border b2 shifts by that times half the height over f
         raise SceneError(f"{where} has the skew b2 = {b2:g}, which COLMAP's lenses lack; align again without b1 and b2")
     focal, center = (f + b1, f), (width / 2.0 + term("cx"), height / 2.0 + term("cy"))
     radial = [term(f"k{power}") for power in range(1, 5)]
