@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from lapgs_plugin.errors import SceneError
-from lapgs_plugin.scenes import Scene, load_scene
+from lapgs_plugin.scenes import Scene, load_cameras, load_scene
 from tests.refusals import refuses
 
 FOV = 0.6911112070083618  # camera_angle_x of NeRF's Blender scenes
@@ -152,6 +152,34 @@ def test_zero_distortion_is_no_distortion(tmp_path: Path) -> None:
     for index, name in enumerate(["pinhole", "OpenCV", "simple-pinhole", "Full OpenCV", "perspective", ""]):
         edit(path, {"camera_model": name}, in_frame=4 + index)
     assert len(load(path).train) == 10
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_distortion_of_no_shape_is_refused(tmp_path: Path, distorted: bool) -> None:
+    path = capture(tmp_path, 3)
+    edit(path, {"distortion_params": [[0.1], [0.2, 0.3]]})
+    refuses(SceneError, "distortion_params = ..0.1., .0.2, 0.3", load_cameras, path, distorted=distorted)
+
+
+@pytest.mark.parametrize(("size", "facts"), [([80], "intrinsics that are no numbers"), ("80", "sees all around; cut")])
+def test_sizes_of_panoramas_are_numbers(tmp_path: Path, size: object, facts: str) -> None:
+    path = capture(tmp_path, 3)
+    edit(path, {"camera_model": "EQUIRECTANGULAR", "w": size, "h": size})
+    refuses(SceneError, facts, load_cameras, path, distorted=True)
+
+
+def test_intrinsics_without_a_size_are_those_of_the_named_photos(tmp_path: Path) -> None:
+    names = [f"images/{i}.png" for i in range(3)]
+    write_images(tmp_path, names, (80, 60))
+    write_images(tmp_path, [name.replace("images", "images_2") for name in names], (40, 30))
+    frames = [frame(name, look_at(eye)) for name, eye in zip(names, eyes(3), strict=True)]
+    write_json(tmp_path / "transforms.json", frames, fl_x=90.0, cx=42.0, cy=28.0)
+    (full, _), (half, _) = (load_cameras(tmp_path, images=images) for images in ("images", "images_2"))
+    for name, camera in full.items():
+        smaller = half[name.replace("images", "images_2")]
+        assert smaller.size == (40, 30)
+        assert (camera.fx, camera.cx, camera.cy) == (90.0, 42.0, 28.0)
+        assert (smaller.fx, smaller.fy, smaller.cx, smaller.cy) == (45.0, 45.0, 21.0, 14.0)
 
 
 def test_matrices_with_few_digits_or_three_rows(tmp_path: Path) -> None:
