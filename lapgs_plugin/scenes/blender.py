@@ -34,6 +34,7 @@ from lapgs_plugin.scenes.source import (
     ALL_AROUND,
     LARGEST,
     PINHOLE_MODELS,
+    SHORTEST_FOCAL,
     Frame,
     SceneSource,
     check_camera,
@@ -53,8 +54,6 @@ TEST_FRAMES = "test_frames"
 """Frames to hold out in a file of ScanNet++."""
 SPLITS = ("train", "val", "test")
 """Parts of a scene for which nerfstudio may list file names."""
-SHORTEST_FOCAL = 0.02
-"""Shortest focal length as a share of the image's side. A shorter one was not written in pixels."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy"}

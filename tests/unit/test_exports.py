@@ -166,6 +166,8 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("metashape", XML, "</chunk>", '</chunk><chunk label="Two"/>', "2 chunks .'Chunk 1', 'Two'., expected one"),
         ("metashape", XML, "<chunk .*</chunk>", "", "0 chunks, expected one"),
         ("metashape", XML, "<document", "<!DOCTYPE d [<!ENTITY a 'b'>]><document", "declares a document type"),
+        ("metashape", XML, ">2.5</scale>", ">-2.5</scale>", "the chunk's scale is -2.5, expected a number above 0"),
+        ("metashape", XML, ">2.5</scale>", ">0</scale>", "the chunk's scale is 0, expected a number above 0"),
         ("metashape", XML, "</chunk>.*", "", "not readable as XML"),
         ("metashape", XML, 'frame" class="adj', 'tube" class="adj', "lens model 'tube', expected frame, fisheye"),
         ("metashape", XML, 'frame" class="adj', 'spherical" class="adj', "192x128 pixels, expected twice as wide"),

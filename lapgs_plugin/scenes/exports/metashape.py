@@ -143,10 +143,13 @@ def _world(chunk: Element, component: str | None, source: Path) -> _World:
         return CHUNK
     turn, shift, scale = (transform.findtext(name) for name in ("rotation", "translation", "scale"))
     where = f"{source}: the chunk's"
+    size = 1.0 if scale is None else number(scale, f"{where} scale")
+    if size <= 0.0:  # a negative one would mirror positions but not rotations
+        raise SceneError(f"{where} scale is {size:g}, expected a number above 0; {EXPORT_AGAIN}")
     return _World(
         np.eye(3) if turn is None else numbers(turn, 9, f"{where} rotation").reshape(3, 3),
         np.zeros(3) if shift is None else numbers(shift, 3, f"{where} translation"),
-        1.0 if scale is None else number(scale, f"{where} scale"),
+        size,
     )
 
 
