@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from plyfile import PlyData, PlyElement
 
 from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes import Scene, load_cameras, load_scene
+from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.refusals import refuses
 
 FOV = 0.6911112070083618  # camera_angle_x of NeRF's Blender scenes
@@ -422,6 +424,33 @@ def test_points_with_float_colors_or_none(tmp_path: Path, caplog: pytest.LogCapt
     assert not caplog.records
     assert bool((load(path).colors == 0.5).all())
     assert "points3d.ply: no colours among x, y, z; its points start grey" in caplog.text
+
+
+@pytest.mark.parametrize("wrong", [None, "turn", "shift"])
+def test_points_of_a_colmap_model_are_moved_to_the_frames(tmp_path: Path, wrong: str | None) -> None:
+    make_sample_scene(tmp_path, width=48, height=32, views=6, points=60, progress=False)
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    turn, scale, shift = cv2.Rodrigues(np.array([0.4, -1.2, 0.7]))[0], 2.5, np.array([3.0, -4.0, 5.0])
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        matrix, pose = np.eye(4), image.cam_from_world().inverse().matrix()
+        matrix[:3, :3] = turn @ pose[:, :3] @ np.diag([1.0, -1.0, -1.0])
+        matrix[:3, 3] = scale * turn @ pose[:, 3] + shift
+        frames.append(frame(f"images/{image.name}", matrix))
+    last = np.array(frames[-1]["transform_matrix"])
+    last[:3, :3] = last[:3, :3] @ cv2.Rodrigues(np.array([0.0, 0.1 * (wrong == "turn"), 0.0]))[0]
+    last[0, 3] += 0.5 * (wrong == "shift")
+    frames[-1]["transform_matrix"] = last.tolist()
+    write_json(tmp_path / "transforms.json", frames, fl_x=50.0, w=48, h=32)
+    points = load(tmp_path).points.numpy()
+    if wrong:
+        assert len(points) == 100_000  # random ones
+        return
+    expected = scale * np.array([point.xyz for point in model.points3D.values()]) @ turn.T + shift
+    order, other = np.lexsort(points.T), np.lexsort(expected.astype(np.float32).T)
+    np.testing.assert_allclose(points[order], expected[other], rtol=0, atol=1e-4)
 
 
 def test_a_ply_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
