@@ -101,7 +101,7 @@ def whole_file(path: Path, kind: str) -> Iterator[Path]:
     Raises:
         LapgsError: the block raised an OSError.
     """
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix.lower()}")
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished.unlink(missing_ok=True)  # a link would be followed

@@ -25,6 +25,7 @@ from lapgs_plugin.errors import SceneError, counted, printable
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.scenes.aligned_points import aligned_points
+from lapgs_plugin.scenes.colmap import find_model
 from lapgs_plugin.scenes.images import find_image, image_size, where_else
 from lapgs_plugin.scenes.lenses import lens_of
 from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
@@ -33,6 +34,7 @@ from lapgs_plugin.scenes.source import (
     ALL_AROUND,
     LARGEST,
     PINHOLE_MODELS,
+    SHORTEST_FOCAL,
     Frame,
     SceneSource,
     check_camera,
@@ -52,10 +54,10 @@ TEST_FRAMES = "test_frames"
 """Frames to hold out in a file of ScanNet++."""
 SPLITS = ("train", "val", "test")
 """Parts of a scene for which nerfstudio may list file names."""
-SHORTEST_FOCAL = 0.02
-"""Shortest focal length as a share of the image's side. A shorter one was not written in pixels."""
 LAST_ROW_ERROR = 1e-4
 """Largest error of the last row of a 4x4 pose."""
+INTRINSICS = {"fl_x", "fl_y", "cx", "cy"}
+"""Intrinsics in pixels."""
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 FISHEYE = "OPENCV_FISHEYE"
 CAMERA_MODELS = {name.replace("_", ""): name for name in (*PINHOLE_MODELS, FISHEYE, ALL_AROUND)} | {
@@ -279,11 +281,19 @@ def _good_frames(file: Path, values: Values, part: str, warnings: list[str]) -> 
 def mask_folder(path: Path) -> str | None:
     """Return the folder of the masks that a transforms file names by `mask_path`, relative to the scene, or None.
 
+    An unreadable file beside a COLMAP model, which is read in its place, names none.
+
     Raises:
         SceneError: the file is unreadable, or the masks are not in a folder of their own.
     """
     file = next((path / name for name in (TRAIN_FILE, SINGLE_FILE) if is_file(path / name)), None)
-    frames = [] if file is None else [frame for frame in _read_json(file)["frames"] if isinstance(frame, dict)]
+    try:
+        entries = [] if file is None else _read_json(file)["frames"]
+    except SceneError:
+        if find_model(path) is None:
+            raise
+        entries = []
+    frames = [frame for frame in entries if isinstance(frame, dict)]
     masks, photos = (
         {PurePosixPath(_portable(frame[key])).parent for frame in frames if isinstance(frame.get(key), str)}
         for key in ("mask_path", "file_path")
@@ -357,10 +367,13 @@ def _read_frames(
             terms = "".join(f", {key} = {value}" for key, value in lens[1].items())
             raise SceneError(f"{where} has a distorted camera ({lens[0]}{terms}); {undistort_hint(path, lens[0])}")
         if not ("w" in posed and "h" in posed):
-            posed["w"], posed["h"] = image_size(image)
+            # Pixels in the file are those of the photos that it names, also where smaller copies are read.
+            named = _image_path(path, _portable(frame["file_path"]), "images") if INTRINSICS & posed.keys() else image
+            posed["w"], posed["h"] = image_size(named if is_file(named) else image)
         if lens[0] == ALL_AROUND:  # programs write focal lengths of several meanings
-            across, down = posed["w"], posed["h"]
-            posed |= {"fl_x": across, "fl_y": across, "cx": across / 2, "cy": down / 2}
+            with suppress(TypeError, ValueError):  # `read_camera` refuses them
+                across, down = float(posed["w"]), float(posed["h"])
+                posed |= {"fl_x": across, "fl_y": across, "cx": across / 2, "cy": down / 2}
         camera = read_camera(posed, where)
         check_camera(f"{file}: the camera of {name}", camera)
         frames.append(Frame(name, image, camera))
@@ -370,7 +383,7 @@ def _read_frames(
 def _lens(values: Values, where: str) -> tuple[str, Values]:
     """Return the camera model of a frame, by COLMAP's name, and its distortion, without zeros."""
     distortion = {key: values[key] for key in DISTORTION_KEYS if values.get(key)}
-    if np.any(values.get("distortion_params") or 0.0):
+    if not _is_zero(values.get("distortion_params")):
         distortion["distortion_params"] = values["distortion_params"]
     written = values.get("camera_model") or (FISHEYE if values.get("is_fisheye") else "OPENCV")
     model = CAMERA_MODELS.get(re.sub(r"[\W_]", "", str(written)).upper())
@@ -380,6 +393,13 @@ def _lens(values: Values, where: str) -> tuple[str, Values]:
             "undistort the photos with the program that wrote it, and export pinhole cameras"
         )
     return FISHEYE if values.get("is_fisheye") else model, distortion
+
+
+def _is_zero(terms: Any) -> bool:
+    """Return whether all terms of a list are zero, or there are none."""
+    with suppress(TypeError, ValueError):
+        return not np.any(terms or 0.0)
+    return False  # lists of several lengths
 
 
 def _image_path(path: Path, file_path: str, images: str) -> Path:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from lapgs_plugin.scenes.images import read_depth, same_shape
 from lapgs_plugin.scenes.masks import AUTO, NONE, common_folder, resolve_folder, stem_of
 from lapgs_plugin.scenes.parallel import in_threads
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.untrusted import require_regular
+from lapgs_plugin.untrusted import require_regular, shortened
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +41,8 @@ FOLDERS = ("depth", "highres_depth", "lowres_depth")
 """Folders of depth maps beside that of the photos; in exports the first is Record3D's and Polycam's, others ARKit's."""
 SUFFIXES = (".npy", ".exr", ".tiff", ".tif", ".png")
 """Of depth maps; of several for a photo the first is read, because pictures of depth lie beside the numbers."""
+NPY_START = b"\x93NUMPY"
+"""First bytes of an .npy file."""
 ENDS = ("", "_depth")
 """What the name of a depth map may have after that of its photo."""
 
@@ -379,8 +382,7 @@ def _read_numbers(file: Path) -> NDArray[np.float32]:
     if file.suffix.lower() != ".npy":
         return read_depth(file, 1.0)
     try:
-        require_regular(file)
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
+        array = open_npy(file)
         if array.dtype.kind not in "fiu":
             raise ValueError(f"it holds {array.dtype}, expected numbers")
         shape = tuple(side for side in array.shape if side != 1)
@@ -389,8 +391,29 @@ def _read_numbers(file: Path) -> NDArray[np.float32]:
         check_size(file, shape[1], shape[0])
         with np.errstate(over="ignore"):  # of float64, as inf
             return np.array(array, np.float32).reshape(shape)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError) as error:
         raise SceneError(f"{file}: the depth map cannot be read ({first_line(error)})") from error
+
+
+def open_npy(file: Path) -> NDArray[Any]:
+    """Return the array of an .npy file, whose numbers are read where they are used.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is damaged, or another file.
+    """
+    require_regular(file)
+    with file.open("rb") as stream:
+        start = stream.read(len(NPY_START))
+    if start != NPY_START:
+        raise ValueError(f"it begins with {shortened(start)}, expected NumPy's .npy format")
+    try:
+        with np.errstate(over="ignore"):  # of a damaged shape
+            return np.lib.format.open_memmap(file, mode="r")
+    except OSError:
+        raise
+    except Exception as error:  # damaged headers raise TypeError, OverflowError, TokenError, ... in NumPy
+        raise ValueError(f"its header is damaged ({first_line(error)})") from error
 
 
 def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:

@@ -11,12 +11,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lapgs_plugin.errors import SceneError, first_line, printable
-from lapgs_plugin.scenes.depth import INSIDE_SHARE, depth_size, find_maps, read_maps
+from lapgs_plugin.scenes.depth import INSIDE_SHARE, depth_size, find_maps, open_npy, read_maps
 from lapgs_plugin.scenes.image_files import check_size
 from lapgs_plugin.scenes.images import read_image, same_shape
 from lapgs_plugin.scenes.masks import NONE, resolve_folder, stem_of
 from lapgs_plugin.scenes.scene import Scene, View
-from lapgs_plugin.untrusted import require_regular
 
 ENDS = ("", "_normal", "_normals")
 """What the name of a map may have after that of its photo."""
@@ -123,8 +122,7 @@ def _read_values(file: Path) -> Tensor:
     if file.suffix.lower() != ".npy":
         return read_image(file, clamp=False)
     try:
-        require_regular(file)
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
+        array = open_npy(file)
         if array.dtype.kind != "f":
             raise ValueError(f"it holds {array.dtype}, expected floating-point numbers")
         if array.ndim != 3 or 3 not in (array.shape[0], array.shape[2]):
@@ -133,5 +131,5 @@ def _read_values(file: Path) -> Tensor:
         check_size(file, array.shape[2 if first else 1], array.shape[1 if first else 0])
         values = torch.from_numpy(np.array(array, np.float32))
         return values if first else values.permute(2, 0, 1)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError) as error:
         raise SceneError(f"{file}: the normal map cannot be read ({first_line(error)})") from error

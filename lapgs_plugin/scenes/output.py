@@ -44,7 +44,7 @@ def check_output(out: Path, overwrite: bool, work: str | None = None) -> None:
 
 @contextmanager
 def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Make a folder that replaces `out` when the block ends, and is removed if it fails.
+    """Make a folder that replaces `out` when the block ends, and is removed if it fails; then `out` stays.
 
     Raises:
         UserInputError: as `check_output`.
@@ -55,7 +55,8 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
     partial, replaced = out.with_name(f"{out.name}.partial"), out.with_name(f"{out.name}.replaced")
     with writing_explained(out):
         try:
-            for leftover in (partial, replaced):
+            # Without `out` the scene that it had is in `replaced`: a call was killed between the two renames.
+            for leftover in (partial, replaced) if out.exists() else (partial,):
                 if leftover.exists():
                     shutil.rmtree(leftover)
             partial.mkdir(parents=True)
@@ -65,6 +66,8 @@ def fresh_scene(out: Path, overwrite: bool) -> Iterator[Path]:
             partial.rename(out)
             shutil.rmtree(replaced, ignore_errors=True)
         except BaseException:
+            if replaced.exists() and not out.exists():
+                replaced.rename(out)
             shutil.rmtree(partial, ignore_errors=True)
             raise
 

@@ -28,6 +28,9 @@ LARGEST = 1e12
 LONGEST_SIDE = 1 << 31
 """Longest side of a camera's image in pixels, before it is compared with the image file."""
 
+SHORTEST_FOCAL = 0.02
+"""Shortest focal length as a share of the image's side. A shorter one was not written in pixels."""
+
 LONGEST_FOCAL = 1e6
 """Longest focal length in sides of the image, longer than that of any telescope."""
 
@@ -95,6 +98,10 @@ def check_camera(subject: str, camera: Camera) -> None:
         (furthest > LARGEST, f"{furthest:g} in its pose, expected at most {LARGEST:g}"),
         (min(camera.fx, camera.fy, *size) <= 0, f"{size[0]}x{size[1]} pixels and {lens}, expected positive numbers"),
         (max(size) > LONGEST_SIDE, f"an image {max(size):.3g} pixels wide or high, expected at most {LONGEST_SIDE}"),
+        (
+            camera.fx < SHORTEST_FOCAL * size[0] or camera.fy < SHORTEST_FOCAL * size[1],
+            f"{lens} for {size[0]}x{size[1]}, expected pixels, at least {SHORTEST_FOCAL:g} sides of the image",
+        ),
         (
             (np.abs(numbers) > LONGEST_FOCAL * np.array([*size, *size])).any(),
             f"{lens} and a principal point ({camera.cx:g}, {camera.cy:g}), expected at most {LONGEST_FOCAL:g} sides of "

@@ -34,6 +34,7 @@ from lapgs_plugin.scenes.depth import (
     resolve_depth,
 )
 from lapgs_plugin.scenes.images import write_image
+from lapgs_plugin.scenes.normals import load_normals
 from lapgs_plugin.scenes.sample import make_sample_scene
 from lapgs_plugin.scenes.sample.raycast import camera_rays, first_hits
 from lapgs_plugin.scenes.sample.world import build_world
@@ -75,6 +76,12 @@ def true_depth(camera: Camera) -> NDArray[np.float32]:
     distance, _ = first_hits(build_world(0), origin, directions)
     depth = distance * (camera.world_to_camera[2, :3].numpy() @ directions)
     return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def npy(header: str) -> bytes:
+    """The beginning of an .npy file of format 1.0, by NumPy's description of it."""
+    line = header.ljust(117).encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line
 
 
 def loaded(path: Path, setting: str = "auto") -> tuple[DepthTargets, Scene, list[str]]:
@@ -179,6 +186,24 @@ def test_only_unusable_maps_are_an_error_of_one_line(scene: Path, write: object,
     assert isinstance(result.exception, SceneError)
     assert result.exception.exit_code == 2
     assert not (scene / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("start", "facts"),
+    [
+        (b"PK\x03\x04", "begins with b'PK.*expected NumPy's .npy format"),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (64, 96"), "header is damaged"),
+        (npy("{'descr': '<f4', 1: False, 'shape': (64, 96)}"), "header is damaged"),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (True, 96)}"), "header is damaged"),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (10000000000000000000000, 96)}"), "header is damaged"),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (4611686018427387904, 96)}"), "header is damaged"),
+    ],
+)
+def test_damaged_arrays_are_an_error_of_one_line(scene: Path, start: bytes, facts: str) -> None:
+    (scene / "depth").mkdir()
+    (scene / "depth" / "0000.npy").write_bytes(start + bytes(4 * SIZE[0] * SIZE[1]))
+    refuses(SceneError, facts, loaded, scene)
+    refuses(SceneError, facts, load_normals, load_scene(scene, progress=False), "depth", print)
 
 
 def test_a_scene_chooses_the_folder_or_none(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -166,10 +166,15 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("metashape", XML, "</chunk>", '</chunk><chunk label="Two"/>', "2 chunks .'Chunk 1', 'Two'., expected one"),
         ("metashape", XML, "<chunk .*</chunk>", "", "0 chunks, expected one"),
         ("metashape", XML, "<document", "<!DOCTYPE d [<!ENTITY a 'b'>]><document", "declares a document type"),
+        ("metashape", XML, ">2.5</scale>", ">-2.5</scale>", "the chunk's scale is -2.5, expected a number above 0"),
+        ("metashape", XML, ">2.5</scale>", ">0</scale>", "the chunk's scale is 0, expected a number above 0"),
         ("metashape", XML, "</chunk>.*", "", "not readable as XML"),
         ("metashape", XML, 'frame" class="adj', 'tube" class="adj', "lens model 'tube', expected frame, fisheye"),
         ("metashape", XML, 'frame" class="adj', 'spherical" class="adj', "192x128 pixels, expected twice as wide"),
         ("metashape", XML, "<f>170.0</f>", "<f>60</f><k1>-2</k1><k2>3</k2><k3>-3</k3><k4>2</k4>", "k4 = 2,.*align"),
+        ("metashape", XML, "<f>170.0</f>", "<f>0</f><k4>0.1</k4>", "'lens' has the focal lengths 0 and 0, expected"),
+        ("metashape", XML, "<f>170.0</f>", "<f>-9</f><k4>0.1</k4>", "'lens' has the focal lengths -9 and -9, expected"),
+        ("metashape", XML, "<f>170.0</f>", "<f>1e-200</f><k4>0.1</k4>", "focal lengths 1e-200 and 1e-200, expected"),
         ("metashape", XML, "<f>170.0</f>", "<f>170</f><b2>1</b2>", "skew b2 = 1,.*align again without b1 and b2"),
         ("metashape", XML, "<f>170.0</f>", "<f>nan</f>", "'lens': its f is 'nan', expected a finite number"),
         ("metashape", XML, '0 a"><transform>[^<]*', '0 a"><transform>1 0 0', "'shot 0 a' is '1 0 0', expected 16"),
@@ -180,6 +185,7 @@ TRAJ = "41069021_frames/lowres_wide.traj"
         ("realitycapture", CSV, "\n[^#].*", "\n", "no cameras in it"),
         ("realitycapture", CSV, ",[^,]*\n$", "\n", "line 8: 15 values .*expected the 16"),
         ("realitycapture", CSV, "shot 2 a.png,[^,]*", "shot 2 a.png,nan", "line 5: x is 'nan', expected a finite"),
+        ("realitycapture", CSV, "shot 2 a", "x" * 140_000, "registration.csv: not readable as CSV .*131072"),
         ("realitycapture", CSV, "shot 2 a", "shot 1 a", "shot 1 a.png is listed twice"),
         ("bundler", OUT, "\n[^\n]*\n$", "\n", "635 lines for 7 cameras and 200 points, expected 636"),
         ("bundler", OUT, "0 0 0", "x 0 0", "camera 0 is .*expected 15 finite numbers"),
@@ -204,6 +210,32 @@ def test_damaged_exports_are_refused(name: str, file: str, pattern: str, by: str
     WRITERS[name](tmp_path, synthetic())
     edit(tmp_path / file, pattern, by)
     refuses(SceneError, facts, load_cameras, tmp_path)
+
+
+def test_a_photo_without_a_name_is_refused_in_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    WRITERS["metashape"](tmp_path, synthetic())
+    edit(tmp_path / XML, 'label="shot 1 a"', 'label=""')
+    monkeypatch.chdir(tmp_path)
+    refuses(SceneError, "cannot be read: Is a directory", load_cameras, Path())
+
+
+@pytest.mark.parametrize("name", ["metashape", "opensfm"])
+def test_panoramas_start_from_the_points_of_their_export(name: str, tmp_path: Path) -> None:
+    capture = replace(synthetic(), size=(192, 96))
+    WRITERS[name](tmp_path, capture)
+    if name == "metashape":
+        file = tmp_path / XML
+        file.write_text(re.sub("<sensor [^>]*>", '<sensor id="0" label="lens" type="spherical">', file.read_text()))
+    else:
+        edit(tmp_path / JSON, '"brown"', '"spherical"')
+    export = find_export(tmp_path)
+    assert export is not None
+    model, source = export.read(tmp_path)
+    assert {camera.model.name for camera in model.cameras.values()} == {"EQUIRECTANGULAR"}
+    np.testing.assert_allclose(source.points, capture.xyz, rtol=0, atol=1e-6)
+    refuses(SceneError, "sees all around; cut its photos", load_cameras, tmp_path)
 
 
 def test_two_exports_are_refused(tmp_path: Path) -> None:

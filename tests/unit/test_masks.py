@@ -104,6 +104,15 @@ def test_every_supervision_honours_masks(name: str) -> None:
     assert torch.equal(image.grad != 0, (mask > 0).expand_as(image))
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"frames": []}'])
+def test_a_damaged_transforms_file_beside_a_colmap_model_names_no_masks(tmp_path: Path, text: str) -> None:
+    make_sample_scene(tmp_path / "scene", width=48, height=32, views=3, points=40, progress=False)
+    (tmp_path / "scene" / "transforms.json").write_text(text)
+    scene = load_scene(tmp_path / "scene", progress=False)
+    assert scene.kind == "colmap"
+    assert not any(view.masked for view in scene.train)
+
+
 def _hiding(scene: Scene, seed: int) -> Scene:
     """The scene with masks, and noise in what they hide."""
     mask, generator = _mask(HEIGHT, WIDTH), torch.Generator().manual_seed(seed)

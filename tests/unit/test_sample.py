@@ -367,6 +367,46 @@ def test_an_interruption_leaves_the_old_scene_and_nothing_else(tmp_path: Path, m
     assert [entry.name for entry in tmp_path.iterdir()] == ["scene"]
 
 
+def test_an_interruption_while_folders_are_renamed_leaves_the_old_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, rename = tmp_path / "scene", Path.rename
+    make_sample_scene(scene, **SMALL)
+    before = snapshot(scene)
+
+    def interrupt(self: Path, target: Path) -> Path:
+        if self.name == "scene.partial":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make_sample_scene(scene, **SMALL, seed=1, overwrite=True)
+    assert snapshot(scene) == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scene"]
+
+
+def test_the_scene_of_a_call_that_was_killed_between_renames_is_kept_until_another_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene"
+    make_sample_scene(scene, **SMALL)
+    before = snapshot(scene)
+    scene.rename(tmp_path / "scene.replaced")  # what a kill leaves there
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_module, "sample_points", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            make_sample_scene(scene, **SMALL, seed=1)
+    assert snapshot(scene) == before
+    make_sample_scene(scene, **SMALL, seed=1, overwrite=True)
+    assert snapshot(scene) != before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scene"]
+
+
 def test_leftovers_of_a_killed_run_do_not_matter(tmp_path: Path) -> None:
     (tmp_path / "scene.partial" / "images").mkdir(parents=True)
     (tmp_path / "scene.partial" / "images" / "0099.png").write_bytes(b"half")

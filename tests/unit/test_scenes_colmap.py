@@ -506,6 +506,8 @@ def test_fewer_than_two_training_views(tmp_path: Path) -> None:
         ("images", Model().pose(4)[1][2], np.nan, r"the camera of 04\.png has NaN or inf"),
         ("images", Model().pose(4)[1][2], np.inf, r"the camera of 04\.png has NaN or inf"),
         *(("cameras", 82.0, focal, r"the camera of 0\d\.png") for focal in (np.nan, 0.0, -5.0)),
+        ("cameras", 82.0, 0.75, r"focal lengths .*0\.75.*expected pixels"),
+        ("cameras", 82.0, 1e-60, r"focal lengths .*1e-60.*expected pixels"),
     ],
 )
 def test_numbers_that_cannot_be_used(tmp_path: Path, name: str, old: float, new: float, message: str) -> None:

@@ -24,6 +24,7 @@ from PIL import Image
 from torch import Tensor
 
 from lapgs_plugin.errors import LapgsError, SceneError, UserInputError
+from lapgs_plugin.files import whole_file
 from lapgs_plugin.scenes.images import (
     PhotoFile,
     check_image,
@@ -662,3 +663,14 @@ def test_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(LapgsError, match=r"a\.png: the image cannot be written"):
         write_image(tmp_path / "file" / "a.png", torch.zeros(3, 4, 4))
+
+
+def test_names_that_differ_in_the_case_of_their_suffix_are_written_at_once(tmp_path: Path) -> None:
+    """Threads write the photos of a folder."""
+    with whole_file(tmp_path / "a.exr", "image") as one, whole_file(tmp_path / "a.EXR", "image") as other:
+        one.write_bytes(b"one")
+        other.write_bytes(b"other")
+    assert [(tmp_path / name).read_bytes() for name in ("a.exr", "a.EXR")] == [b"one", b"other"]
+    image = torch.from_numpy(noise(3, 6, 5))
+    write_image(tmp_path / "a.EXR", image)
+    assert torch.equal(read_image(tmp_path / "a.EXR"), image)

@@ -9,13 +9,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from lapgs_plugin.errors import SceneError
-from lapgs_plugin.scenes import Scene, load_scene
+from lapgs_plugin.scenes import Scene, load_cameras, load_scene
+from lapgs_plugin.scenes.sample import make_sample_scene
 from tests.refusals import refuses
 
 FOV = 0.6911112070083618  # camera_angle_x of NeRF's Blender scenes
@@ -152,6 +154,34 @@ def test_zero_distortion_is_no_distortion(tmp_path: Path) -> None:
     for index, name in enumerate(["pinhole", "OpenCV", "simple-pinhole", "Full OpenCV", "perspective", ""]):
         edit(path, {"camera_model": name}, in_frame=4 + index)
     assert len(load(path).train) == 10
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_distortion_of_no_shape_is_refused(tmp_path: Path, distorted: bool) -> None:
+    path = capture(tmp_path, 3)
+    edit(path, {"distortion_params": [[0.1], [0.2, 0.3]]})
+    refuses(SceneError, "distortion_params = ..0.1., .0.2, 0.3", load_cameras, path, distorted=distorted)
+
+
+@pytest.mark.parametrize(("size", "facts"), [([80], "intrinsics that are no numbers"), ("80", "sees all around; cut")])
+def test_sizes_of_panoramas_are_numbers(tmp_path: Path, size: object, facts: str) -> None:
+    path = capture(tmp_path, 3)
+    edit(path, {"camera_model": "EQUIRECTANGULAR", "w": size, "h": size})
+    refuses(SceneError, facts, load_cameras, path, distorted=True)
+
+
+def test_intrinsics_without_a_size_are_those_of_the_named_photos(tmp_path: Path) -> None:
+    names = [f"images/{i}.png" for i in range(3)]
+    write_images(tmp_path, names, (80, 60))
+    write_images(tmp_path, [name.replace("images", "images_2") for name in names], (40, 30))
+    frames = [frame(name, look_at(eye)) for name, eye in zip(names, eyes(3), strict=True)]
+    write_json(tmp_path / "transforms.json", frames, fl_x=90.0, cx=42.0, cy=28.0)
+    (full, _), (half, _) = (load_cameras(tmp_path, images=images) for images in ("images", "images_2"))
+    for name, camera in full.items():
+        smaller = half[name.replace("images", "images_2")]
+        assert smaller.size == (40, 30)
+        assert (camera.fx, camera.cx, camera.cy) == (90.0, 42.0, 28.0)
+        assert (smaller.fx, smaller.fy, smaller.cx, smaller.cy) == (45.0, 45.0, 21.0, 14.0)
 
 
 def test_matrices_with_few_digits_or_three_rows(tmp_path: Path) -> None:
@@ -394,6 +424,33 @@ def test_points_with_float_colors_or_none(tmp_path: Path, caplog: pytest.LogCapt
     assert not caplog.records
     assert bool((load(path).colors == 0.5).all())
     assert "points3d.ply: no colours among x, y, z; its points start grey" in caplog.text
+
+
+@pytest.mark.parametrize("wrong", [None, "turn", "shift"])
+def test_points_of_a_colmap_model_are_moved_to_the_frames(tmp_path: Path, wrong: str | None) -> None:
+    make_sample_scene(tmp_path, width=48, height=32, views=6, points=60, progress=False)
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    turn, scale, shift = cv2.Rodrigues(np.array([0.4, -1.2, 0.7]))[0], 2.5, np.array([3.0, -4.0, 5.0])
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        matrix, pose = np.eye(4), image.cam_from_world().inverse().matrix()
+        matrix[:3, :3] = turn @ pose[:, :3] @ np.diag([1.0, -1.0, -1.0])
+        matrix[:3, 3] = scale * turn @ pose[:, 3] + shift
+        frames.append(frame(f"images/{image.name}", matrix))
+    last = np.array(frames[-1]["transform_matrix"])
+    last[:3, :3] = last[:3, :3] @ cv2.Rodrigues(np.array([0.0, 0.1 * (wrong == "turn"), 0.0]))[0]
+    last[0, 3] += 0.5 * (wrong == "shift")
+    frames[-1]["transform_matrix"] = last.tolist()
+    write_json(tmp_path / "transforms.json", frames, fl_x=50.0, w=48, h=32)
+    points = load(tmp_path).points.numpy()
+    if wrong:
+        assert len(points) == 100_000  # random ones
+        return
+    expected = scale * np.array([point.xyz for point in model.points3D.values()]) @ turn.T + shift
+    order, other = np.lexsort(points.T), np.lexsort(expected.astype(np.float32).T)
+    np.testing.assert_allclose(points[order], expected[other], rtol=0, atol=1e-4)
 
 
 def test_a_ply_without_points_starts_from_random_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -38,6 +38,8 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
 """From axes of OpenGL (x right, y up, z backwards) to those of COLMAP (x right, y down, z forward), and back."""
 INEXACT = 0.1
 """Largest error in pixels of a lens that COLMAP has no model for."""
+LARGEST_CORNER = 1e3
+"""Largest diagonal of a perspective image, in focal lengths, whose distortion is fitted."""
 ALL_AROUND_LENSES = ("spherical", "equirectangular")
 EXPORT_AGAIN = "export it again"
 
@@ -127,7 +129,7 @@ class PhotoFinder:
         """
         written = PurePosixPath(file_name(name))
         parts = [part for part in written.parts if part not in ("/", "..")]
-        for folder in self._folders:
+        for folder in self._folders if parts else ():  # exports may have photos without a name
             for place in (folder.joinpath(*parts), folder / written.name):
                 if is_file(file := self._spelled(place)):
                     return file
@@ -243,13 +245,20 @@ def perspective(
         where: begins a message.
 
     Raises:
-        SceneError: the polynomial has a fourth factor and cannot be expressed by a lens of COLMAP.
+        SceneError: the polynomial has a fourth factor and cannot be expressed by a lens of COLMAP, or it has one and
+            the focal lengths are not positive pixels.
     """
     if not any((*radial, *tangential)):
         return lens("PINHOLE", size, [*focal, *center])
     k1, k2, k3, *others = (*radial, *(0.0,) * (6 - len(radial)))
     if others[0]:
-        terms, error = rational_terms((k1, k2, k3, others[0]), float(np.hypot(*size)) / (2.0 * min(focal)))
+        diagonal = float(np.hypot(*size))
+        if not min(focal) > diagonal / LARGEST_CORNER:
+            raise SceneError(
+                f"{where} has the focal lengths {focal[0]:g} and {focal[1]:g}, expected positive numbers of pixels; "
+                f"{EXPORT_AGAIN}"
+            )
+        terms, error = rational_terms((k1, k2, k3, others[0]), diagonal / (2.0 * min(focal)))
         if not error * max(focal) <= INEXACT:
             raise SceneError(
                 f"{where} has the distortion k4 = {others[0]:g}, which COLMAP's lenses cannot express within {INEXACT} "

@@ -143,10 +143,13 @@ def _world(chunk: Element, component: str | None, source: Path) -> _World:
         return CHUNK
     turn, shift, scale = (transform.findtext(name) for name in ("rotation", "translation", "scale"))
     where = f"{source}: the chunk's"
+    size = 1.0 if scale is None else number(scale, f"{where} scale")
+    if size <= 0.0:  # a negative one would mirror positions but not rotations
+        raise SceneError(f"{where} scale is {size:g}, expected a number above 0; {EXPORT_AGAIN}")
     return _World(
         np.eye(3) if turn is None else numbers(turn, 9, f"{where} rotation").reshape(3, 3),
         np.zeros(3) if shift is None else numbers(shift, 3, f"{where} translation"),
-        1.0 if scale is None else number(scale, f"{where} scale"),
+        size,
     )
 
 
@@ -184,7 +187,7 @@ def _lens(sensor: Element, source: Path) -> pycolmap.Camera | None:
         return number(calibration.findtext(name, "0"), f"{where}: its {name}")
 
     f, b1, b2, p1, p2 = (term(name) for name in ("f", "b1", "b2", "p1", "p2"))
-    if abs(b2) * height > 2.0 * INEXACT * f:  # at the upper border b2 shifts by that times half the height over f
+    if abs(b2) * height > 2.0 * INEXACT * abs(f):  # at the upper border b2 shifts by that times half the height over f
         raise SceneError(f"{where} has the skew b2 = {b2:g}, which COLMAP's lenses lack; align again without b1 and b2")
     focal, center = (f + b1, f), (width / 2.0 + term("cx"), height / 2.0 + term("cy"))
     radial = [term(f"k{power}") for power in range(1, 5)]

@@ -13,6 +13,7 @@ from lapgs_plugin.files import is_file
 from lapgs_plugin.scenes.exports.base import Array, Shot
 from lapgs_plugin.scenes.images import read_depth, read_image
 from lapgs_plugin.scenes.point_cloud import PointCloud, read_point_cloud
+from lapgs_plugin.scenes.source import ALL_AROUND
 
 TRIED_POINTS = 2_000
 """Most points that are compared."""
@@ -46,10 +47,16 @@ def points_beside(source: Path, *more: Path) -> PointCloud | None:
 
 
 def seen_share(points: Array, shots: Sequence[Shot]) -> float:
-    """Return the share of points (n, 3) that at least one camera sees, were none hidden and no lens distorted."""
+    """Return the share of points (n, 3) that at least one camera sees, were none hidden and no lens distorted.
+
+    A panorama sees all.
+    """
     some = points[:: len(points) // TRIED_POINTS + 1]
     seen = np.zeros(len(some), bool)
     for shot in shots[:: len(shots) // TRIED_SHOTS + 1]:
+        if shot.camera.model.name == ALL_AROUND:  # pycolmap has no calibration matrix of it
+            seen[:] = True
+            break
         local = some @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
         matrix, (width, height) = shot.camera.calibration_matrix(), (shot.camera.width, shot.camera.height)
         front = local[:, 2] > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +67,7 @@ def _rows(source: Path) -> dict[int, dict[str, str]]:
     """Return the values of each camera by column, by the number of its line."""
     text = read_text(source, error=SceneError, advice=EXPORT_AGAIN, written=True)
     columns, lines, rows = _columns(text), text.splitlines(), dict[int, dict[str, str]]()
-    for line, row in enumerate(csv.reader(lines), 1):
+    for line, row in enumerate(_values(source, lines), 1):
         if not row or row[0].startswith("#"):
             continue
         if len(row) != len(columns):
@@ -79,6 +79,14 @@ def _rows(source: Path) -> dict[int, dict[str, str]]:
     if not rows:
         raise SceneError(f"{source}: no cameras in it; align the photos and export them again")
     return rows
+
+
+def _values(source: Path, lines: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the values of each line of a CSV."""
+    try:
+        yield from csv.reader(lines)
+    except csv.Error as error:  # a value of more than 131,072 characters
+        raise SceneError(f"{source}: not readable as CSV ({error}); {EXPORT_AGAIN}") from error
 
 
 def _shot(where: str, file: Path, size: tuple[int, int], row: Mapping[str, str]) -> Shot:

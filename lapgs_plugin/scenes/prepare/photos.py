@@ -85,7 +85,7 @@ def find_photos(source: Path, masks: Path | None = None) -> Photos:
             "JPEG, PNG, TIFF, BMP, WebP or HEIC; of a video give the file itself"
         )
     if others:
-        left = [file.name for file in present if file not in chosen]
+        left = [file.name for file in present if not has_photo_suffix(file)]
         logger.warning("not photos, left out: %s", listed(left))
     converted = {file for file in chosen if _kind(file) in CONVERTED}
     originals = [file.relative_to(source) for file in chosen]
