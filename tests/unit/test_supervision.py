@@ -52,6 +52,6 @@ def test_a_gpu_takes_the_fused_ssim_that_is_installed(monkeypatch: pytest.Monkey
         return fused_ssim(*(image.as_subclass(torch.Tensor) for image in images))
 
     monkeypatch.setattr(chosen, "fused_ssim", lambda: counted)
-    loss = photometric_loss(prediction.as_subclass(OnGpu), target)
+    loss = photometric_loss(prediction.as_subclass(OnGpu), target.as_subclass(OnGpu))
     assert calls == [[(1, 3, 20, 30)] * 2]
     torch.testing.assert_close(loss.as_subclass(torch.Tensor), expected)
