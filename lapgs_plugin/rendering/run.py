@@ -146,7 +146,10 @@ def _as_rendered(
     Raises:
         RunFolderError: as `_as_trained` and `refined`.
     """
-    if moved_to is not None and _is_of_others(archive.manifest.scene, {**train, **test}):
+    reference = archive.manifest.scene
+    # Of the folder that the run was trained on, such as `lapgs train` gives at its end, files need not be read again.
+    moved = moved_to is not None and moved_to.absolute() != Path(reference.path)
+    if moved and _is_of_others(reference, {**train, **test}):
         return dict(train), dict(test)
     train, test = _as_trained(archive, train, test)
     return refined(archive, train), refined(archive, test)

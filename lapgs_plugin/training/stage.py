@@ -196,9 +196,8 @@ class StageRun:
         ranks, ended = self.prepared.ranks, self.counts.iteration >= self.stage.iterations
         if self.budget is not None and (ended or self._late_steps % ranks.steps_a_decision == 0):
             self._last(ranks.from_leader(self.budget.length(self.counts.iteration)))
-            if (
-                not ended and self.counts.iteration == self.stage.iterations
-            ):  # `_step` did not know that it was the last
+            ends_now = self.counts.iteration >= self.stage.iterations
+            if ends_now and not ended:  # `_step` did not know that it was the last
                 self.require_finite(self.counts.iteration)
 
     def note_gains(self, psnrs: Sequence[float]) -> None:

@@ -81,12 +81,13 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     Raises:
         UserInputError: as `photometric_loss`; the target may require a gradient, and gets none.
     """
-    check_arguments(prediction, target.detach(), 1.0)
+    target = target.detach()
+    check_arguments(prediction, target, 1.0)
     if prediction.shape[1] == 3 and triton_works(prediction, target):
         from lapgs_plugin.ops.photometric_loss.in_triton import ssim_map_triton
 
-        return ssim_map_triton(prediction, target.detach())
-    return ssim_map_torch(prediction, target.detach())
+        return ssim_map_triton(prediction, target)
+    return ssim_map_torch(prediction, target)
 
 
 def decoded(target: Tensor) -> Tensor:
