@@ -46,6 +46,10 @@ from lapgs_plugin.reference_raster.layout import (
     VANISHING,
 )
 
+KEPT_ALPHAS = 1 << 19
+"""Pairs of a pixel and a Gaussian up to which intermediates of all tiles are kept for the backward pass. Computing them
+again imports PyTorch's compiler, which takes seconds, and self-checks come before each command's first GPU render."""
+
 
 @dataclass(frozen=True)
 class Projection:
@@ -89,7 +93,8 @@ class TileLists:
 class OracleRasterizer(Rasterizer):
     """Render in plain PyTorch, on the device and in the precision (float32 or float64) of the field's tensors.
 
-    The backward pass computes each tile again, so that memory holds the intermediates of one tile at a time.
+    The backward pass of all but small images computes each tile again, so that memory holds the intermediates of one
+    tile at a time.
 
     Args:
         three_sigma_cut: False for rasterizers that blend a Gaussian wherever alpha reaches 1/255: every Gaussian in
@@ -396,14 +401,17 @@ def _blend_tiles(splats: Tensor, ids: Tensor, lists: TileLists, absgrad2d: Tenso
     owners = torch.split(ids[lists.members], lists.counts)  # (k,) for each tile
     steps = torch.arange(TILE, dtype=splats.dtype, device=splats.device)  # (16,)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)  # (256, 2) x, y
-    tiles = []
+    tiles, recompute = [], len(grid) * sum(lists.counts) > KEPT_ALPHAS
     for index, (part, owner) in enumerate(zip(parts, owners, strict=True)):
         row, column = divmod(index, lists.columns)
         pixels = grid + grid.new_tensor([column * TILE, row * TILE])  # (256, 2)
         blended = _decide(part, pixels)  # (256, k)
         used = blended.any(dim=0).nonzero()[:, 0]  # (m,) the others have no gradient
         blend = partial(_blend, pixels=pixels, blended=blended[:, used], ids=owner[used], absgrad2d=absgrad2d)
-        tiles.append(checkpoint(blend, part[used], use_reentrant=False, preserve_rng_state=False))
+        if recompute:
+            tiles.append(checkpoint(blend, part[used], use_reentrant=False, preserve_rng_state=False))
+        else:
+            tiles.append(blend(part[used]))
     tiled = torch.stack(tiles).reshape(lists.rows, lists.columns, TILE, TILE, 4)
     image = tiled.permute(4, 0, 2, 1, 3).reshape(4, lists.rows * TILE, lists.columns * TILE)
     return image[:3], image[3]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given, settings
 from torch import Tensor
 
+from lapgs_plugin.reference_raster import oracle
 from lapgs_plugin.reference_raster.oracle import OracleRasterizer, projection_jacobians
 from lapgs_plugin.reference_raster.thresholds import ThresholdMask, threshold_mask
 from tests.raster import naive, scenes
@@ -287,3 +291,24 @@ def assert_float32_equals_float64(case: Case) -> None:
     expected = scenes.gradients(ORACLE, rounded.to(torch.float64), weights.double())
     assert all(value.dtype == torch.float32 for value in actual.values())
     assert_gradients_match(actual, expected, FLOAT32_BOUNDS, excused=mask.kinks)
+
+
+def test_tiles_that_are_computed_again_have_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = scenes.random_case(40, 33, 18, seed=42, sh_degree=1, name="both_ways")
+    weights = torch.randn(3, 18, 33, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    kept = scenes.gradients(ORACLE, case, weights)
+    monkeypatch.setattr(oracle, "KEPT_ALPHAS", 0)
+    again = scenes.gradients(ORACLE, case, weights)
+    assert all(torch.equal(again[name], gradient) for name, gradient in kept.items())
+
+
+def test_small_images_do_without_pytorchs_compiler() -> None:
+    lines = (
+        "import sys, torch",
+        "from lapgs_plugin.reference_raster.oracle import OracleRasterizer",
+        "from tests.raster import scenes",
+        "case = scenes.random_case(150, 40, 28, seed=0, sh_degree=1, name='small')",
+        "scenes.gradients(OracleRasterizer(), case, torch.ones(3, 28, 40, dtype=torch.float64))",
+        "assert 'torch._dynamo' not in sys.modules",
+    )
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, cwd=Path(__file__).parents[2])
