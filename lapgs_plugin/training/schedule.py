@@ -18,6 +18,11 @@ PIXELS_OF_A_STEP = 1 << 22
 """Most pixels of all views of one step where the number of views is left to the program."""
 STEPS_OF_A_STAGE = 900
 """Fewest steps of a stage where the program chooses the number of views; a short stage takes fewer views a step."""
+PIXELS_TO_FILL = 1 << 21
+"""Pixels of a step below which the processor takes longer to start kernels than the GPU to run them. More views up to
+these cost little time, so that a short stage takes them, too, and has fewer steps."""
+STEPS_OF_A_FILLED_STAGE = 300
+"""Fewest steps of a stage then."""
 RECOVERY = 300
 """Iterations that a field needs after a reset of opacities."""
 MOST_PADDING = 0.05
@@ -39,7 +44,8 @@ def views_per_step(settings: TrainSettings, stage: Stage, training_views: int, b
     asked = settings.asked_views
     if asked is None:
         pixels, ranks = stage.image_size[0] * stage.image_size[1], settings.ranks
-        limits = round(ranks * PIXELS_OF_A_STEP / pixels), stage.iterations // STEPS_OF_A_STAGE
+        filled = min(ranks * PIXELS_TO_FILL // pixels, stage.iterations // STEPS_OF_A_FILLED_STAGE)
+        limits = round(ranks * PIXELS_OF_A_STEP / pixels), max(filled, stage.iterations // STEPS_OF_A_STAGE)
         asked = max(1, min(MOST_VIEWS, training_views, *limits)) if batches else 1
         asked = max(ranks, asked // ranks * ranks)
     return asked

@@ -222,8 +222,16 @@ def test_how_many_views_a_step_takes() -> None:
     assert views(3) == [3, 3]
     assert views(None) == [8, 8]  # 133k and 533k pixels of four million
     assert views(None, training=5) == [5, 5]
-    short = StagePlan.create((978, 545), 3600, 2)
-    assert [views_per_step(TrainSettings(), stage, 219, batches=True) for stage in short] == [2, 2]
+
+    def of_short(size: tuple[int, int], iterations: int) -> list[int]:
+        stages = StagePlan.create(size, iterations, 2)
+        return [views_per_step(TrainSettings(), stage, 219, batches=True) for stage in stages]
+
+    assert of_short((978, 545), 9000) == [8, 5], "two megapixels are 15 and 3 of them, and 900 steps allow 5"
+    assert of_short((978, 545), 3600) == [6, 3], "300 steps allow 6"
+    assert of_short((978, 545), 500) == [1, 1]
+    assert of_short((1062, 1894), 3600) == [4, 2], "more than two megapixels together take longer"
+    assert of_short((3093, 2312), 3600) == [2, 1]
     assert views(None, batches=False) == [1, 1]
     (large,) = StagePlan.create((3429, 3390), 30_000, 1)
     assert views_per_step(TrainSettings(views_per_step="auto"), large, 45, batches=True) == 1
