@@ -42,7 +42,7 @@ from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.tensorboard import require_tensorboard
-from lapgs_plugin.training.time_budget import cost_of, parse_duration, require_time_left
+from lapgs_plugin.training.time_budget import LEAST_LEFT, cost_of, parse_duration, require_time_left
 
 MAY_CHANGE = ("images_on", "prediction_precision", "time")
 """Settings that may change when a run is continued."""
@@ -206,13 +206,14 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
     """Return settings with about as many iterations as --time allows, from which the strategy and the split follow.
 
     Raises:
-        UserInputError: no time is left for training, or the settings do not go with so few iterations.
+        UserInputError: too little time is left for training, or the settings do not go with so few iterations.
     """
     settings = request.settings
     assert settings.time is not None
     ranks, seconds = request.ranks, parse_duration(settings.time)
     rate = ranks.from_leader(ranks.size * views_per_second(scene, settings, placed))
-    require_time_left(settings.time, spent := ranks.from_leader(time.monotonic() - request.began))
+    spent = ranks.from_leader(time.monotonic() - request.began)
+    require_time_left(settings.time, spent, LEAST_LEFT)
     size = scene.smallest_size
     split = make_plan(size, settings.for_size(size))
     iterations = max(settings.levels, round(rate * (seconds - spent) * split.iterations / cost_of(split)))

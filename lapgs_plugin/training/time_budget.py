@@ -22,8 +22,13 @@ COARSER_COST = 0.35
 on four scenes (H200). So a level's share of the seconds is not that of the iterations, which `--split` is about."""
 GAUSSIAN_BYTES = 248
 """Of a Gaussian in a PLY of SH degree 3."""
-WRITTEN_BYTES = 2e8
-"""Bytes of PLY files that are archived a second; 1.7e8 seen where they were put together property by property."""
+WRITTEN_BYTES = 4e8
+"""Bytes of PLY files that are archived a second; 8e8 seen on one host with a GPU."""
+END_SECONDS = 1.0
+"""What a command takes to end after its last level is archived, as Python and CUDA do; 1 to 1.5 seen."""
+LEAST_LEFT = 1 / 3
+"""Least time for training, by what was spent before: photos of levels, exposure and kernels come next, and took that
+long on hosts where reading took 11 s."""
 
 
 def cost_of(stages: Iterable[Stage]) -> float:
@@ -36,8 +41,8 @@ def cost_of(stages: Iterable[Stage]) -> float:
 
 
 def seconds_to_archive(gaussians: int) -> float:
-    """Estimate how long it takes to write so many Gaussians."""
-    return gaussians * GAUSSIAN_BYTES / WRITTEN_BYTES
+    """Estimate how long it takes to write so many Gaussians, and to end."""
+    return END_SECONDS + gaussians * GAUSSIAN_BYTES / WRITTEN_BYTES
 
 
 def parse_duration(text: str) -> float:
@@ -61,12 +66,18 @@ def parse_duration(text: str) -> float:
     return seconds
 
 
-def require_time_left(text: str, spent: float) -> None:
-    """Raise a UserInputError if so many seconds leave nothing of a duration for training."""
-    if spent >= parse_duration(text):
+def require_time_left(text: str, spent: float, least: float = 0.0) -> None:
+    """Raise a UserInputError if seconds that were spent leave too little of a duration for training.
+
+    Args:
+        text: the duration.
+        spent: seconds.
+        least: share of these that has to be left.
+    """
+    if spent * (1 + least) >= parse_duration(text):
         raise UserInputError(
-            f"--time {text}: reading the scene and compiling took {spent:.1f} s, so that nothing is left for training; "
-            "give more"
+            f"--time {text}: reading the scene and compiling took {spent:.1f} s, so that too little is left for "
+            f"training; give {math.ceil(2 * spent)}s or more"
         )
 
 

@@ -14,12 +14,12 @@ from lapgs_plugin.hooks import StageContext, StageHook
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.settings import TrainSettings
-from lapgs_plugin.training.time_budget import COARSER_COST
+from lapgs_plugin.training.time_budget import COARSER_COST, END_SECONDS
 from tests.training_runs import StopAt, plys, resume, train
 from tests.training_scene import ring_scene
 
-TIMED = TrainSettings(iterations=400, time="6s", sh_degree=1, appearance="affine", split="1/2,1/2", joint=0.25)
-"""Of `Ticks` that is 889 iterations; 400 are what was expected."""
+TIMED = TrainSettings(iterations=400, time="7s", sh_degree=1, appearance="affine", split="1/2,1/2", joint=0.25)
+"""Of `Ticks` that is 889 iterations and a second to end; 400 are what was expected."""
 
 
 class Ticks(StageHook):
@@ -86,9 +86,10 @@ def test_a_run_killed_before_it_saved_anything_of_its_time_has_all_of_it(scene: 
         train(tmp_path / "run", scene, planned, monitor=StopAt(0, 20))
     base = RunArchive.open(tmp_path / "run").manifest.record(1)
     seconds = base.train_seconds + sum(base.overhead_seconds.values())
-    time = f"{min(0.5, seconds / 2):.3f}s"
-    archive = resume(tmp_path / "run", scene, replace(planned, time=time), **timed())
-    assert archive.manifest.record(0).iterations == pytest.approx(20 + 100 * float(time[:-1]), rel=0.2)
+    for_training = min(0.5, seconds / 2)
+    timed_run = replace(planned, time=f"{END_SECONDS + for_training:.3f}s")
+    archive = resume(tmp_path / "run", scene, timed_run, **timed())
+    assert archive.manifest.record(0).iterations == pytest.approx(20 + 100 * for_training, rel=0.2)
 
 
 def test_divergence_is_named_where_the_clock_ends_a_level_at_once(scene: Scene, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -39,10 +40,13 @@ def test_a_duration_is_positive_and_finite(text: str) -> None:
         parse_duration(text)
 
 
-def test_a_time_shorter_than_reading_the_scene_leaves_nothing() -> None:
-    require_time_left("4s", 3.9)
-    with pytest.raises(UserInputError, match=r"--time 4s: reading .* took 4\.1 s, .*; give more"):
-        require_time_left("4s", 4.1)
+@pytest.mark.parametrize(("least", "enough", "too_much"), [(0.0, 3.9, 4.1), (1 / 3, 2.9, 3.1)])
+def test_a_time_shorter_than_reading_the_scene_leaves_nothing(least: float, enough: float, too_much: float) -> None:
+    require_time_left("4s", enough, least)
+    longer = math.ceil(2 * too_much)
+    with pytest.raises(UserInputError, match=rf"--time 4s: reading .* took {too_much} s, .*; give {longer}s or more"):
+        require_time_left("4s", too_much, least)
+    require_time_left(f"{longer}s", too_much, least)
 
 
 class Clock:
@@ -132,7 +136,8 @@ def test_levels_share_the_seconds_so_that_they_share_the_iterations() -> None:
         reserve = seconds_to_archive(1_000_000 * (3 - index))
         budget = StageBudget(clock, 100.0, stage.iterations, share, reserve)
         trained_on.append(trained(budget, clock, lambda i, level=stage.level: 0.01 * COARSER_COST**level))  # type: ignore[misc]
-        clock.seconds += seconds_to_archive(1_000_000)
+        clock.seconds += seconds_to_archive(1_000_000) - seconds_to_archive(0)
+    clock.seconds += seconds_to_archive(0)
     assert clock.seconds == pytest.approx(100.0, rel=0.01)
     shares = [count / sum(trained_on) for count in trained_on]
     assert shares == pytest.approx([stage.iterations / plan.iterations for stage in plan], abs=0.02)
