@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
-from curves import at_time, points_of
+from curves import Point, at_time, points_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs/data"
@@ -33,6 +33,8 @@ QUALITY = {
 }
 OURS = "--rasterizer lapgs"
 """Option of runs of checkouts with our rasterizer; their own scripts beside them have their own."""
+EARLIEST = 0.7
+"""Seconds, by those of the first point of a curve, before which it is not read."""
 COST = {"peak GB": ("peak_gb", "{:.2f}")}
 
 
@@ -103,10 +105,10 @@ def train() -> str:
 
 
 def equal_time() -> str:
-    """Return the longest runs of both hierarchies against one field: after the same seconds, and at its best."""
-    same, best = "after the same seconds: ", "against its best: "
-    figures = ["PSNR", "after fit", "SSIM", "LPIPS"]
-    header = ["", "method", "seconds", same + figures[0], *figures[1:], best + "time", "after fit", "LPIPS"]
+    """Return the shortest and longest runs of hierarchies against one field: after the same seconds, at its best."""
+    gains = ["PSNR", "after fit", "LPIPS"]
+    header = ["", "method", "shortest: seconds", *gains, "default: seconds", *gains]
+    header += ["against its best: time", "after fit", "LPIPS"]
     rows = []
     runs = runs_of("curves")
     for scene in dict.fromkeys(run["scene"] for run in runs):
@@ -115,15 +117,29 @@ def equal_time() -> str:
         most = max(field, key=lambda point: point["psnr_fit"])
         first = scene_title(here[0])
         for method in ("nested", "laplacian"):
-            point = points_of(here, method)[-1]
-            then = at_time(field, point["seconds"])
-            gains = [f"{point[name] - then[name]:+.2f}" for name in ("psnr", "psnr_fit")]
-            gains += [f"{point['ssim'] - then['ssim']:+.3f}", f"{point['lpips'] / then['lpips'] - 1:+.1%}"]
-            whole = [f"{point['seconds'] / most['seconds']:.2f}", f"{point['psnr_fit'] - most['psnr_fit']:+.2f}"]
-            whole.append(f"{point['lpips'] / most['lpips'] - 1:+.1%}")
-            rows.append([first, method, f"{point['seconds']:.1f}", *gains, *whole])
+            points = points_of(here, method)
+            last = points[-1]
+            cells = [
+                cell
+                for point in (points[0], last)
+                for cell in (f"{point['seconds']:.1f}", *at_equal_time(point, field))
+            ]
+            cells += [f"{last['seconds'] / most['seconds']:.2f}", f"{last['psnr_fit'] - most['psnr_fit']:+.2f}"]
+            rows.append([first, method, *cells, f"{last['lpips'] / most['lpips'] - 1:+.1%}"])
             first = ""
     return markdown(header, rows)
+
+
+def at_equal_time(point: Point, field: Sequence[Point]) -> list[str]:
+    """Return how much more PSNR, as it is and after the fit, and LPIPS a point has than one field by then.
+
+    The cells are empty where one field was not measured so early.
+    """
+    if point["seconds"] < EARLIEST * field[0]["seconds"]:
+        return [""] * 3
+    then = at_time(field, point["seconds"])
+    gains = [f"{point[name] - then[name]:+.2f}" for name in ("psnr", "psnr_fit")]
+    return [*gains, f"{point['lpips'] / then['lpips'] - 1:+.1%}"]
 
 
 def ours() -> str:
