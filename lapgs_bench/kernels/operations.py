@@ -27,8 +27,8 @@ from lapgs_plugin.ops import (
     upsample,
 )
 from lapgs_plugin.ops.adam import multi_tensor
-from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
+from lapgs_plugin.ops.adam.on_cpu import FieldAdam
 from lapgs_plugin.ops.bilateral_grid.in_torch import add_variation_torch, slice_grids_torch
 from lapgs_plugin.ops.color_transform.in_torch import transform_colors_torch
 from lapgs_plugin.ops.densification_statistics.in_torch import add_statistics_torch

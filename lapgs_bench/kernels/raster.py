@@ -29,7 +29,7 @@ from lapgs_plugin.fields.rasterizer import Rasterizer
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.limits import usable_processors
 from lapgs_plugin.ops.adam import ADAM_EPS
-from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.adam.on_cpu import FieldAdam
 from lapgs_plugin.ops.photometric_loss.in_numba import photometric_loss_cpu
 from lapgs_plugin.ops.photometric_loss.in_torch import photometric_loss_torch
 from lapgs_plugin.reference_raster import CpuRasterizer, OracleRasterizer, pipeline

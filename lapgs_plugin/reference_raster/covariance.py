@@ -5,7 +5,7 @@ Gradients are those of the CUDA code; DEPARTURE marks where these are not the de
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -34,7 +34,9 @@ from lapgs_plugin.reference_raster.layout import (
     VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
-from lapgs_plugin.reference_raster.pipeline import Kept, View
+
+if TYPE_CHECKING:  # it has kernels
+    from lapgs_plugin.reference_raster.pipeline import Kept, View
 
 
 def matrices(covariances: Tensor) -> Tensor:

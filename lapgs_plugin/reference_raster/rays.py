@@ -27,7 +27,6 @@ from lapgs_plugin.fields.spherical_harmonics import sh_to_color
 from lapgs_plugin.jit.threads import parallel
 from lapgs_plugin.reference_raster.layout import MIN_ALPHA, NEAR_DEPTH, PIXEL_VARIANCE, TILE, TILE_PIXELS
 from lapgs_plugin.reference_raster.oracle import TileLists, rotation_matrices, tile_lists
-from lapgs_plugin.reference_raster.ray_kernels import RAY_SPLAT, blend_rays, ray_gradients
 
 SPREAD = 0.1
 """Distance of the projected points from the centre, over the root of 3 standard deviations."""
@@ -190,6 +189,8 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, tiles: _Tiles, splats: Tensor) -> Tensor:
+        from lapgs_plugin.reference_raster.ray_kernels import blend_rays
+
         values = splats.detach().contiguous().numpy()
         blended = np.empty((len(tiles.seen), 4, TILE_PIXELS), values.dtype)
         parallel(blend_rays, tiles.starts, tiles.members, values, tiles.rays, tiles.seen, blended)
@@ -200,6 +201,8 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, from_above: Tensor) -> tuple[None, Tensor]:
+        from lapgs_plugin.reference_raster.ray_kernels import RAY_SPLAT, ray_gradients
+
         tiles: _Tiles = ctx.tiles
         (splats,) = ctx.saved_tensors
         values = splats.detach().contiguous().numpy()

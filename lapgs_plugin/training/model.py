@@ -17,7 +17,7 @@ from lapgs_plugin.ops.adam import (
     step_together,
     triton_works,
 )
-from lapgs_plugin.ops.adam.in_numba import FieldAdam
+from lapgs_plugin.ops.adam.on_cpu import FieldAdam
 from lapgs_plugin.training.settings import LearningRates
 
 SH_REST_SCALE = 1 / 20

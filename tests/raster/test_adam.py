@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lapgs_plugin.errors import UserInputError
-from lapgs_plugin.ops.adam.in_numba import FieldAdam
 from lapgs_plugin.ops.adam.in_torch import AdamSlot, step_torch
+from lapgs_plugin.ops.adam.on_cpu import FieldAdam
 
 SH_SHAPE = (37, 16, 3)
 

@@ -56,3 +56,23 @@ def test_training_does_not_import_pytorchs_compiler(tmp_path: Path) -> None:
         f"assert not {{*{COMPILERS}}} & {{*sys.modules}}",
     ]
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)
+
+
+def test_numba_is_imported_by_its_kernels_alone() -> None:
+    """Commands that train and render on a GPU have no use for it."""
+    modules = (
+        "training.preparation",
+        "training.trainer",
+        "rendering.run",
+        "evaluation.metrics",
+        "viewer.preview",
+        "runner.driver",
+    )
+    lines = [
+        "import sys",
+        *(f"import lapgs_plugin.{module}" for module in modules),
+        "assert 'numba' not in sys.modules",
+        "import lapgs_plugin.reference_raster.pipeline",
+        "assert 'numba' in sys.modules",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)

@@ -211,7 +211,7 @@ def test_no_optimizer_of_ours_imports_pytorchs_compiler(made: str) -> None:
     lines = [
         "import sys, torch",
         "from lapgs_plugin.ops.adam import GpuFieldAdam",
-        "from lapgs_plugin.ops.adam.in_numba import FieldAdam",
+        "from lapgs_plugin.ops.adam.on_cpu import FieldAdam",
         "from lapgs_plugin.ops.adam.multi_tensor import MultiTensorAdam",
         "values = torch.nn.Parameter(torch.ones(5, 3))",
         "values.grad = torch.ones(5, 3)",
