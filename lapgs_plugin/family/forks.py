@@ -368,6 +368,9 @@ class EfficientGS(Rasterizer):
         if output.blending is not None and top_k > 0:
             largest = (_times_named(output.blending.leaders(top_k), len(means3D)) > 0).int()
         if output.blending is not None and pix_loss is not None:
+            if pix_loss.shape[-2:] != output.image.shape[-2:]:
+                shape, expected = tuple(pix_loss.shape), tuple(output.image.shape)
+                raise UserInputError(f"pix_loss is {shape}: expected {expected}, of the image that is rendered")
             losses = output.blending.weighted_shares(pix_loss.detach().sum(0).reshape(-1))
         image = output.image.permute(1, 2, 0) if settings.use_hwc else output.image
         return image, output.radii, largest, empty, empty, losses, empty, empty

@@ -222,6 +222,9 @@ def test_efficientgs_leaves_out_sh_and_marks_the_largest_shares() -> None:
     leaders = shares.flatten(1).argmax(0)[shares.flatten(1).max(0).values > 0]
     assert (largest - (torch.bincount(leaders, minlength=40) > 0).int()).abs().sum() <= 1
     assert 0 < float(losses.sum()) < float((shares * loss.sum(0)).sum())
+    options["pix_loss"] = loss[:, :-1]
+    with pytest.raises(UserInputError, match=r"pix_loss is \(3, 40, 53\): expected \(3, 41, 53\)"):
+        call(module, "efficientgs", case, activated(case) | options, **more)
 
 
 def test_pixel_weights_of_another_level_are_resized() -> None:
