@@ -172,7 +172,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
         if settings.time is not None:  # how long it may be is measured once the photos are read
             make_plan(size, settings, photos)
             return
-        settings = settings.for_size(size)
+        settings = settings.for_size(size, choose="strategy" not in request.chosen)
         require_pruning(make_plan(size, settings, photos), settings)
 
     scene = load_reference(reference, decide, **_reading(request, settings))
@@ -217,7 +217,8 @@ def _fitted_into_time(request: TrainRequest, scene: Scene, placed: PlacedRasteri
     size = scene.smallest_size
     split = make_plan(size, settings.for_size(size))
     iterations = max(settings.levels, round(rate * (seconds - spent) * split.iterations / cost_of(split)))
-    settings = settings.lasting(iterations, choose="strategy" not in request.chosen).for_size(size)
+    choose = "strategy" not in request.chosen
+    settings = settings.lasting(iterations, choose).for_size(size, choose)
     require_pruning(make_plan(size, settings, len(scene.train)), settings)
     say(
         f"--time {settings.time}: {seconds - spent:.1f} s are left for training, about {iterations:,} iterations of "

@@ -17,6 +17,7 @@ from lapgs_plugin.training.strategies import (
     FEW_PHOTOS,
     GRADIENTS,
     LONG_RUN,
+    LONG_RUN_OF_LARGE,
     MCMC,
     PANEL,
     STRATEGIES,
@@ -105,7 +106,8 @@ class Densification:
         AUTO,
         "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
         "does), multiview (the same, only where several views have large errors), or one of an installed package. "
-        f"auto: mcmc from {LONG_RUN} iterations on, else 3dgs; an option that only one of the two has chooses it.",
+        f"auto: mcmc from {LONG_RUN} iterations on, with large photos from {LONG_RUN_OF_LARGE}, else 3dgs; an option that "
+        "only one of the two has chooses it.",
         panel=PANEL,
     )
     start: int | None = option(
@@ -331,18 +333,27 @@ class TrainSettings(HierarchySettings):
         Raises:
             UserInputError: another one than 3DGS's with the paper's settings.
         """
-        density, paper = self.densification, self.protocol == "paper"
+        density = self.densification
         if isinstance(density.options, Auto):
-            heuristics = ["--protocol paper"] if paper else self._idle(STRATEGIES[MCMC])
             # Along rays there is MCMC alone, which long runs choose.
             length = max(self.scheduled, LONG_RUN) if self.distorted else self.scheduled
-            name = density.options.choose(length, heuristics)
-            chosen = replace(density, strategy=name, options=density.options.options_for(name))
-            object.__setattr__(self, "densification", chosen)  # the dataclass is frozen
-        elif paper and density.strategy != GRADIENTS:
+            object.__setattr__(self, "densification", self._chosen(density.options, length))  # the dataclass is frozen
+        elif self.protocol == "paper" and density.strategy != GRADIENTS:
             raise UserInputError(
                 f"--strategy {density.strategy} with --protocol paper: the paper has {GRADIENTS}; leave one out"
             )
+
+    def _chosen(self, options: Auto, length: int) -> Densification:
+        """Return density control with the strategy that auto means for a run of so many iterations."""
+        heuristics = ["--protocol paper"] if self.protocol == "paper" else self._idle(STRATEGIES[MCMC])
+        name = options.choose(length, heuristics)
+        return replace(self.densification, strategy=name, options=options.options_for(name))
+
+    @property
+    def _as_auto(self) -> Auto:
+        """The strategy's options, as if it was to be chosen."""
+        options = self.densification.options
+        return Auto(**{each.name: getattr(options, each.name) for each in fields(options)})
 
     def _check_base(self) -> None:
         """Refuse settings of a base if there is none, or if the next level inherits all of its coefficients."""
@@ -428,20 +439,25 @@ class TrainSettings(HierarchySettings):
         """
         control = self.densification
         if choose:
-            values = {each.name: getattr(control.options, each.name) for each in fields(control.options)}
-            control = replace(control, strategy=AUTO, options=Auto(**values))
+            control = replace(control, strategy=AUTO, options=self._as_auto)
         return replace(self, iterations=iterations, densification=control)
 
-    def for_size(self, size: tuple[int, int]) -> TrainSettings:
+    def for_size(self, size: tuple[int, int], choose: bool = False) -> TrainSettings:
         """Return settings whose residuals, if they have two levels and no split was given, are split for their images.
 
         Args:
             size: (width, height) of the smallest photo.
+            choose: choose the strategy by the size, too, as auto does.
         """
-        large = self.densification.options.large_split
-        if large is None or not is_large(size) or self.split is not None or self.nested or self.levels != 2:
+        if not is_large(size):
             return self
-        return replace(self, split=large)
+        settings = self
+        if choose and LONG_RUN_OF_LARGE <= self.scheduled < LONG_RUN:
+            settings = replace(self, densification=self._chosen(self._as_auto, LONG_RUN))
+        large = settings.densification.options.large_split
+        if large is None or settings.split is not None or settings.nested or settings.levels != 2:
+            return settings
+        return replace(settings, split=large)
 
     @property
     def stops_early(self) -> bool:

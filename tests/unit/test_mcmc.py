@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ from lapgs_plugin.training.model import TrainableField
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.schedule import StageSchedule
 from lapgs_plugin.training.settings import Densification, LearningRates, TrainSettings
-from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, MCMC, Auto, Gradients, Mcmc
+from lapgs_plugin.training.strategies import GRADIENTS, LONG_RUN, LONG_RUN_OF_LARGE, MCMC, Auto, Gradients, Mcmc
 from tests.training_runs import Said, StopAt, plys, resume, ring_manifest, train
 from tests.training_scene import blob_field, ring_camera, ring_scene
 
@@ -445,6 +447,26 @@ def test_limits_follow_the_pixels_of_a_level() -> None:
     assert limits((32_000, 160_000)) == [2_000, 10_000]
     assert limits((10**9, 10**9), cap_max=70) == [70, 70]
     assert limits((10**9, 10**9), base_cap_max=70) == [70, 1_000_000]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"iterations": LONG_RUN_OF_LARGE}, MCMC),
+        ({"iterations": LONG_RUN_OF_LARGE - 1}, GRADIENTS),
+        ({"iterations": LONG_RUN_OF_LARGE, "densification": Densification(options=Auto(absgrad=True))}, GRADIENTS),
+        ({"iterations": LONG_RUN_OF_LARGE, "prune": 0.01}, GRADIENTS),
+        ({"iterations": LONG_RUN_OF_LARGE, "protocol": "paper"}, GRADIENTS),
+    ],
+)
+def test_auto_takes_mcmc_for_shorter_runs_of_large_photos(options: dict[str, Any], expected: str) -> None:
+    settings = TrainSettings(**options)
+    assert settings.densification.strategy == GRADIENTS
+    large = settings.for_size((1062, 1894), choose=True)
+    assert large.densification.strategy == expected
+    assert large.shares == ((Fraction(2, 3), Fraction(1, 3)) if expected == MCMC else settings.shares)
+    assert settings.for_size((1062, 1894)).densification == settings.densification, "it was asked for"
+    assert settings.for_size((980, 545), choose=True) is settings
 
 
 @pytest.mark.parametrize(
