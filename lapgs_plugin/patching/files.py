@@ -31,7 +31,7 @@ def read_only(changes: Iterable[FileChange]) -> list[Path]:
 
 
 def uncommitted(paths: Iterable[Path]) -> list[Path]:
-    """Return the files that differ from their last commit in git in more than our own edits.
+    """Return the files that differ from their last commit in git in more than our own edits, committed or not.
 
     Each file is looked up in the repository that it belongs to, which may be a submodule. Files that git does not
     track, and all files without git, are left out.
@@ -154,15 +154,19 @@ def _put_back(change: FileChange) -> bool:
 
 
 def _differs_from_head(path: Path) -> bool:
-    committed = _git(path, "rev-parse", "--verify", "--quiet", f"HEAD:./{path.resolve().name}")
+    name = path.resolve().name
+    committed, current = _git(path, "cat-file", "blob", f"HEAD:./{name}"), path.read_bytes()
     if committed is None:
         return False
-    # hash-object applies git's conversions on commit, such as CRLF to LF.
-    current = _git(path, "hash-object", "--stdin", "--path", path.resolve().name, stdin=pristine(path.read_bytes()))
-    return current is not None and current != committed
+    before, after = pristine(committed), pristine(current)
+    if before == after:  # git, too, leaves CRLF as they are in files that were committed with them
+        return False
+    # With a path hash-object applies git's conversions on commit, such as CRLF to LF.
+    converted = _git(path, "hash-object", "--stdin", "--path", name, stdin=after)
+    return converted is not None and converted != _git(path, "hash-object", "--stdin", stdin=before)
 
 
-def _git(path: Path, *arguments: str, stdin: bytes = b"") -> str | None:
+def _git(path: Path, *arguments: str, stdin: bytes = b"") -> bytes | None:
     """Return the output of a git command in the file's folder, or None if it fails."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
@@ -176,4 +180,4 @@ def _git(path: Path, *arguments: str, stdin: bytes = b"") -> str | None:
         )
     except OSError:
         return None
-    return result.stdout.decode().strip() if result.returncode == 0 else None
+    return result.stdout if result.returncode == 0 else None

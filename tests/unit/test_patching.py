@@ -449,9 +449,9 @@ def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> N
         folder.chmod(0o755)
 
 
-def git(folder: Path, *arguments: str) -> None:
+def git(folder: Path, *arguments: str) -> bytes:
     identity = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "protocol.file.allow=always")
-    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
+    return subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True).stdout
 
 
 @pytest.mark.parametrize("autocrlf", ["false", "true"])
@@ -475,6 +475,39 @@ def test_uncommitted_changes_are_those_that_are_not_ours(target: Target, tmp_pat
     files[1].write_bytes(files[1].read_bytes() + b"// mine\n")
     assert uncommitted(files) == [files[1]]
     git(inner.folder, "add", ".")
+    assert uncommitted(files) == [files[1]]
+
+
+def test_committed_edits_are_no_uncommitted_changes(target: Target) -> None:
+    git(target.folder, "init")
+    files = [target.folder / file for file in PROGRAMS]
+    apply(target, "signed")
+    git(target.folder, "add", ".")
+    git(target.folder, "commit", "-m", "patched")
+    assert uncommitted(files) == []
+    apply(target, "build")
+    assert uncommitted(files) == []
+    revert(target, ALL_SETS)
+    assert uncommitted(files) == []
+    files[1].write_bytes(files[1].read_bytes() + b"// mine\n")
+    assert uncommitted(files) == [files[1]]
+
+
+@pytest.mark.parametrize("autocrlf", ["true", "input"])
+def test_line_endings_that_git_leaves_alone_are_no_uncommitted_changes(target: Target, autocrlf: str) -> None:
+    """A file that was committed with CRLF is not converted."""
+    files = [target.folder / file for file in PROGRAMS]
+    for path in files:
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    git(target.folder, "init")
+    git(target.folder, "-c", "core.autocrlf=false", "add", ".")
+    git(target.folder, "commit", "-m", "all")
+    git(target.folder, "config", "core.autocrlf", autocrlf)
+    assert git(target.folder, "status", "--short") == b""
+    assert uncommitted(files) == []
+    apply(target, ALL_SETS)
+    assert uncommitted(files) == []
+    files[1].write_bytes(files[1].read_bytes() + b"// mine\r\n")
     assert uncommitted(files) == [files[1]]
 
 
