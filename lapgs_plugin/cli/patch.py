@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import io
+import os
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -171,7 +173,10 @@ def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
 
 
-def _unified(change: FileChange, checkout: Path) -> str:
+def _unified(change: FileChange, checkout: Path) -> bytes:
+    """Return a diff that `git apply` takes, in the encoding and with the line endings of the file."""
     name = change.path.relative_to(checkout).as_posix()
-    before, after = (data.decode("utf-8", "replace").split("\n") for data in (change.before, change.after))
-    return "".join(f"{line}\n" for line in difflib.unified_diff(before, after, f"a/{name}", f"b/{name}", lineterm=""))
+    before, after = (io.BytesIO(data).readlines() for data in (change.before, change.after))
+    names = (os.fsencode(f"{side}/{name}") for side in "ab")
+    lines = difflib.diff_bytes(difflib.unified_diff, before, after, *names)
+    return b"".join(line if line.endswith(b"\n") else line + b"\n\\ No newline at end of file\n" for line in lines)

@@ -964,6 +964,23 @@ def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     assert "nothing to remove" in lapgs_patch("revert", checkout)
 
 
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("last", [b"\n", b""])
+def test_git_applies_the_diff(rasterizer: Path, ending: bytes, last: bytes) -> None:
+    """Also where an edit is near the end of a file, and where comments are no UTF-8."""
+    for path in rasterizer.rglob("*.[ch]*"):
+        text = path.read_bytes().replace(b"result += 0.5f;", b"result += 0.5f; // \xd6\xd0")
+        path.write_bytes((text.rstrip(b"\n") + last).replace(b"\n", ending))
+    command = [sys.executable, "-m", "lapgs_plugin", "patch", "diff", str(rasterizer)]
+    diff = subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
+    (rasterizer.parent / "lapgs.diff").write_bytes(diff.stdout)
+    git(rasterizer, "apply", "../lapgs.diff")
+    applied = snapshot(rasterizer)
+    git(rasterizer, "apply", "--reverse", "../lapgs.diff")
+    lapgs_patch("apply", rasterizer)
+    assert snapshot(rasterizer) == applied
+
+
 @pytest.mark.parametrize("inside", ["ms/train.py", "ms"])
 def test_a_training_script_stands_for_its_checkout(rasterizer: Path, inside: str) -> None:
     """As for `lapgs doctor`."""
