@@ -19,7 +19,7 @@ from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recip
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
 
 ALL_SETS = "all"
-"""Name for all sets to revert, or for all to apply that are not opt-in."""
+"""Name for all sets in the sources, to revert, or for all of the recipe that are not opt-in, to apply."""
 
 DEPTH = 4
 """Depth of folders below a checkout at which extensions are searched, enough for a checkout inside another one."""
@@ -115,7 +115,7 @@ def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]
         PatchError: a block was changed after it was written.
     """
     sources = _read(target)
-    sets = frozenset(target.recipe.sets if ALL_SETS in sets else sets)
+    sets = _present_sets(sources.values()) if ALL_SETS in sets else frozenset(sets)
     _refuse(target, [problem for file, source in sources.items() for problem in _damage(file, source, sets)])
     after = {file: without_blocks(source, sets) for file, source in sources.items()}
     return _changes(target, sources, after)
@@ -169,7 +169,9 @@ def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange,
     recipe, sources = target.recipe, _read(target)
     wanted = frozenset(recipe.default_sets if ALL_SETS in sets else sets) | _present_sets(sources.values())
     problems = [
-        f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})
+        f"{name} is not among its sets of edits ({', '.join(recipe.sets)}); if another version of lapgs applied it, "
+        "take it out with `lapgs patch revert`"
+        for name in sorted(wanted - {*recipe.sets})
     ]
     after = {}
     for file in recipe.files:

@@ -389,7 +389,8 @@ def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, by
     renewed = apply(target, "signed")
     assert renewed == apply(write_tree(target.folder, tree), "signed")
     newer = replace(RECIPE, edit=(EDITS["guard"],))
-    refuses(PatchError, "signed is not among its sets of edits", plan_apply, Target(newer, target.folder), ["build"])
+    facts = "signed is not among its sets of edits.*`lapgs patch revert`"
+    refuses(PatchError, facts, plan_apply, Target(newer, target.folder), ["build"])
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -962,6 +963,15 @@ def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     lapgs_patch("revert", checkout)
     assert snapshot(checkout) == pristine
     assert "nothing to remove" in lapgs_patch("revert", checkout)
+
+
+def test_revert_takes_out_sets_that_only_another_version_has(rasterizer: Path) -> None:
+    pristine = snapshot(rasterizer)
+    lapgs_patch("apply", rasterizer)
+    header = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
+    header.write_text(header.read_text().replace("build-cuda13/", "build-cuda14/"))
+    lapgs_patch("revert", rasterizer)
+    assert snapshot(rasterizer) == pristine
 
 
 @pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
