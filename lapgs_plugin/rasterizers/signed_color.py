@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
 from collections.abc import Iterator
 from enum import Enum
 from functools import cached_property
@@ -161,7 +162,7 @@ def explain_fallback(module: str, checkout: Path) -> str:
             f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run "
             f"`{target.reinstall}`"
         )
-    return f"{slow}; run `lapgs patch apply {checkout}` and then `{target.reinstall}`"
+    return f"{slow}; run `lapgs patch apply {shlex.quote(str(checkout))}` and then `{target.reinstall}`"
 
 
 def _sources(module: str, checkout: Path) -> Iterator[Target]:

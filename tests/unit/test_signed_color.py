@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -174,6 +176,12 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Target:
 def test_unpatched_sources_are_to_be_patched(target: Target, tmp_path: Path) -> None:
     said = explain_fallback("some_extension", tmp_path)
     assert f"run `lapgs patch apply {tmp_path}` and then `pip install {target.folder}`" in said
+
+
+def test_the_command_can_be_pasted_where_names_have_spaces(target: Target, tmp_path: Path) -> None:
+    folder = tmp_path / "my code"
+    (command,) = re.findall("`(lapgs patch apply .*?)`", explain_fallback("some_extension", folder))
+    assert shlex.split(command) == ["lapgs", "patch", "apply", str(folder)]
 
 
 def test_patched_sources_beside_an_old_build_are_said_to_be_stale(target: Target, tmp_path: Path) -> None:
