@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
@@ -69,7 +69,7 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
 def write_all(changes: Sequence[FileChange]) -> None:
     """Write every file through a temporary file beside it; on failure restore the files written so far.
 
-    Permissions are kept, links are followed.
+    Permissions are kept, and the owner where this user may set it; links are followed.
 
     Raises:
         PatchError: a file could not be written, or was changed after the change was planned.
@@ -127,7 +127,7 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
 
 
 def _beside(path: Path, data: bytes) -> Path:
-    """Write a new file in the same folder with the permissions of `path`, and return its path."""
+    """Write a new file in the same folder with the owner and permissions of `path`, and return its path."""
     target = path.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=_SUFFIX)
     temporary = Path(name)
@@ -136,6 +136,9 @@ def _beside(path: Path, data: bytes) -> Path:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
+        if sys.platform != "win32":
+            with suppress(OSError):  # only root may; in a container it writes to checkouts of others
+                os.chown(temporary, target.stat().st_uid, target.stat().st_gid)
         shutil.copymode(target, temporary)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.files import shipped
+from lapgs_plugin.files import is_file, shipped
 from lapgs_plugin.patching.tokens import occurrences, tokenize
 from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
@@ -192,7 +192,7 @@ def read_source(path: Path) -> str:
 
 def _stands(anchor: Anchor, folder: Path) -> bool:
     path = folder / anchor.file
-    if not path.is_file():
+    if not is_file(path):  # a folder that this user may not search, such as lost+found, has none
         return False
     tokens = tokenize(read_source(path)) if anchor.find else []
     return not anchor.find or bool(occurrences(tokens, anchor.find, range(len(tokens))))

@@ -438,6 +438,16 @@ def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
     assert stat.S_IMODE(moved.stat().st_mode) == 0o755
 
 
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may give files away")
+def test_files_of_others_stay_theirs(target: Target) -> None:
+    """As after `lapgs patch apply` in a container that has somebody's checkout mounted."""
+    files = [target.folder / file for file in PROGRAMS]
+    for path in files:
+        os.chown(path, 1234, 4321)
+    apply(target, ALL_SETS)
+    assert [(path.stat().st_uid, path.stat().st_gid) for path in files] == [(1234, 4321)] * 2
+
+
 def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> None:
     changes = plan_apply(target, [ALL_SETS])
     assert read_only(changes) == []
@@ -882,6 +892,23 @@ def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, dep
     checkout = [rasterizer, *rasterizer.parents][depth]
     (target,) = find_targets(checkout)
     assert (target.recipe.name, target.folder) == ("graphdeco", rasterizer)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has other permissions")
+def test_a_folder_that_may_not_be_read_is_no_rasterizer(rasterizer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As lost+found, or what another user's container wrote into the checkout."""
+    folder = rasterizer / "output"
+    folder.mkdir(mode=0)
+    recipes = load_recipes()
+    monkeypatch.chdir(rasterizer)  # whose parents are root's alone
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(1234)
+    try:
+        assert [recipe.name for recipe in recipes if recipe.recognises(Path())] == ["graphdeco"]
+        assert not any(recipe.recognises(Path("output")) for recipe in recipes)
+    finally:
+        os.seteuid(user)
 
 
 def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
