@@ -162,6 +162,11 @@ def explain_fallback(module: str, checkout: Path) -> str:
             f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run "
             f"`{target.reinstall}`"
         )
+    if state is State.IMPOSSIBLE:
+        return (
+            f"{slow}; the patch does not fit its sources in {target.folder}: `lapgs patch status "
+            f"{shlex.quote(str(checkout))}` says where"
+        )
     return f"{slow}; run `lapgs patch apply {shlex.quote(str(checkout))}` and then `{target.reinstall}`"
 
 

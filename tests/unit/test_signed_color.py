@@ -91,12 +91,6 @@ class AlwaysSigned(Unpatched):
         return ORACLE(replace(field, signed=True), camera, background=background, sh_degree=0)
 
 
-def test_the_flag_is_the_sign_bit_and_leaves_the_degree() -> None:
-    for degree in range(4):
-        assert signed_degree(degree) < 0
-        assert signed_degree(degree) & ~SIGNED_COLOR_BIT == degree
-
-
 @pytest.mark.parametrize(
     ("extension", "native"), [(Unpatched, False), (Patched, True), (PatchedForward, False), (AlwaysSigned, False)]
 )
@@ -190,6 +184,13 @@ def test_patched_sources_beside_an_old_build_are_said_to_be_stale(target: Target
     assert f"sources in {target.folder} are patched, but the installed build is older" in said
     assert f"run `pip install {target.folder}`" in said
     assert "lapgs patch" not in said
+
+
+def test_sources_that_the_patch_does_not_fit_are_not_to_be_patched(target: Target, tmp_path: Path) -> None:
+    (target.folder / "shade.cu").write_text("float shade() { return 0.25f; }\n")
+    said = explain_fallback("some_extension", tmp_path)
+    assert f"does not fit its sources in {target.folder}: `lapgs patch status {tmp_path}` says where" in said
+    assert "lapgs patch apply" not in said
 
 
 def test_sources_of_another_module_say_nothing_about_this_one(target: Target, tmp_path: Path) -> None:
