@@ -43,7 +43,7 @@ class Target:
     @property
     def reinstall(self) -> str:
         """The command that builds and installs it again."""
-        return self.recipe.reinstall.format(folder=as_pip_argument(self.folder))
+        return self.recipe.reinstall.replace("{folder}", as_pip_argument(self.folder))  # ${NAMES} of shells stay
 
 
 @dataclass(frozen=True)

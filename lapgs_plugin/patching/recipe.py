@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -58,6 +59,9 @@ class Edit:
 
     def __post_init__(self) -> None:
         _require_tokens(self.find)
+        for name in (self.set, self.name):
+            if not re.fullmatch(r"[\w-]+", name, re.ASCII):  # others would not be found again in the blocks of a file
+                raise ValueError(f"{shortened(name)} is no name of a set or an edit, expected letters, digits, _ and -")
         if (self.before is None) == (self.replace is None):
             raise ValueError(f"{self.name!r} has both or none, expected either `before` or `replace`")
         if not self.put.isascii():

@@ -935,6 +935,8 @@ EDIT = HEAD + '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\n'
         (HEAD.replace("[]", "[3]"), "present[0] is 3"),
         (EDIT + 'find = "d"\nbefore = "e"\nunless = ["include"]', "directives that start with #"),
         (EDIT + 'find = " "\nbefore = "e"', "nothing to find"),
+        (EDIT.replace('"a"', '"a b"') + 'find = "d"\nbefore = "e"', "'a b' is no name of a set or an edit"),
+        (EDIT.replace('"b"', '"a.b"') + 'find = "d"\nbefore = "e"', "'a.b' is no name of a set or an edit"),
     ],
 )
 def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -945,13 +947,15 @@ def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: st
 def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> None:
     edit = '[[edit]]\nset = "a"\nname = "{}"\nfile = "c"\nfind = "d"\nbefore = "{}"\n'
     head = 'name = "{}"\ntitle = "T"\npresent = [{{ file = "{}" }}]\n'
-    base = head.format("base", "x") + 'reinstall = "make {folder}"\n' + edit.format("one", 1) + edit.format("two", 2)
+    reinstall = "CUDA_HOME=${CUDA} make {folder}"
+    base = head.format("base", "x") + f'reinstall = "{reinstall}"\n' + edit.format("one", 1) + edit.format("two", 2)
     child = head.format("child", "y") + 'extends = "base"\n' + edit.format("one", 3) + edit.format("three", 4)
     (tmp_path / "base.toml").write_text(base)
     (tmp_path / "child.toml").write_text(child)
     recipe = load_recipes(tmp_path)[1]
+    assert Target(recipe, Path("/here")).reinstall == "CUDA_HOME=${CUDA} make /here"
     assert [(e.name, e.put) for e in recipe.edit] == [("one", "3"), ("two", "2"), ("three", "4")]
-    assert (recipe.present, recipe.reinstall) == ((Anchor("y"),), "make {folder}")
+    assert (recipe.present, recipe.reinstall) == ((Anchor("y"),), reinstall)
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
