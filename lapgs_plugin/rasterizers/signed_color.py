@@ -119,10 +119,12 @@ def has_signed_color(extension: CudaExtension) -> bool:
         unseen = extension.render(field, camera, background=white, sh_degree=0, colors=black).image[0]  # (h, w)
     weight = 1 - unseen  # of the only Gaussian
     image_error = (result.image.detach() - weight * expected[:, None, None]).abs().max()
-    # The image is weight * C0 * sh_0 in each channel, so all channels have the same gradient unless the negative ones
-    # were clamped. Its size is not tested: a backward pass that loses part of it does not make colours wrong.
+    # The image is weight * C0 * (sh_0 + sqrt(3) sh_2) in each channel, so these gradients are the same unless negative
+    # channels were clamped, or only the forward pass was patched and the other one takes the degree for 0. Their size
+    # is not tested: a backward pass that loses part of it does not make colours wrong.
     slope = float(weight.sum()) / math.sqrt(4 * math.pi)
-    spread = float(gradient[0, 0].max() - gradient[0, 0].min())
+    slopes = torch.stack([gradient[0, 0], gradient[0, 2] / math.sqrt(3)])  # (2, 3)
+    spread = float(slopes.max() - slopes.min())
     return bool(image_error <= PROBE_TOLERANCE) and slope > 0 and spread <= PROBE_TOLERANCE * slope
 
 

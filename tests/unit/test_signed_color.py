@@ -84,6 +84,15 @@ class PatchedForward(Patched):
         return replace(right, image=right.image.detach() + clamped.image - clamped.image.detach())
 
 
+class PatchedForwardAlone(Patched):
+    """An extension whose backward pass was not patched: it takes the degree for 0."""
+
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        right = super().with_sh(field, camera, background, sh_degree)
+        constant = super().with_sh(field, camera, background, sh_degree & SIGNED_COLOR_BIT)
+        return replace(right, image=right.image.detach() + constant.image - constant.image.detach())
+
+
 class AlwaysSigned(Unpatched):
     """An extension that takes the degree for 0."""
 
@@ -92,7 +101,8 @@ class AlwaysSigned(Unpatched):
 
 
 @pytest.mark.parametrize(
-    ("extension", "native"), [(Unpatched, False), (Patched, True), (PatchedForward, False), (AlwaysSigned, False)]
+    ("extension", "native"),
+    [(Unpatched, False), (Patched, True), (PatchedForward, False), (PatchedForwardAlone, False), (AlwaysSigned, False)],
 )
 def test_the_probe_finds_out_what_an_extension_does(extension: type[Unpatched], native: bool) -> None:
     assert has_signed_color(extension()) is native
