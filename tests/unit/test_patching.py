@@ -349,10 +349,12 @@ def test_a_block_that_was_only_reformatted_can_be_taken_out(target: Target) -> N
 def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
     apply(target, ALL_SETS)
     path = target.folder / SHADE
-    head, tail = path.read_bytes().rsplit(marker, 1)
-    path.write_bytes(head + tail)
-    for plan in (plan_apply, plan_revert):
-        refuses(PatchError, "half a lapgs block", plan, target, [ALL_SETS])
+    source = path.read_bytes()
+    for parts in (source.split(marker, 1), source.rsplit(marker, 1)):
+        path.write_bytes(b"".join(parts))
+        for plan in (plan_apply, plan_revert):
+            for name in (ALL_SETS, *RECIPE.sets):
+                refuses(PatchError, "half a lapgs block", plan, target, [name])
 
 
 def test_states(target: Target) -> None:
