@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import math
 import shlex
-from collections.abc import Iterator
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -155,7 +154,7 @@ def explain_fallback(module: str, checkout: Path) -> str:
     slow = (
         f"{module} has no signed colour: residual fields are rendered with SH evaluated in PyTorch, correct but slower"
     )
-    target = next(_sources(module, checkout), None)
+    target = _source(module, checkout)
     if target is None:
         return f"{slow}; `lapgs patch apply CHECKOUT` on the sources it was built from, then reinstall it"
     state = {patches.set: patches.state for patches in status(target)}.get(SIGNED_COLOR_SET)
@@ -172,10 +171,11 @@ def explain_fallback(module: str, checkout: Path) -> str:
     return f"{slow}; run `lapgs patch apply {shlex.quote(str(checkout))}` and then `{target.reinstall}`"
 
 
-def _sources(module: str, checkout: Path) -> Iterator[Target]:
-    """Yield the known extensions in the checkout that install this module."""
+def _source(module: str, checkout: Path) -> Target | None:
+    """Return the extension in the checkout that installs this module; None if there is none, or more than one."""
     try:
         targets = find_targets(checkout)
     except PatchError:  # no checkout with a rasterizer: the message is then more general
-        return
-    yield from (target for target in targets if (target.folder / module).is_dir())
+        return None
+    sources = [target for target in targets if (target.folder / module).is_dir()]
+    return sources[0] if len(sources) == 1 else None  # a folder of several checkouts

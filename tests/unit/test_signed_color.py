@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -201,6 +202,16 @@ def test_sources_that_the_patch_does_not_fit_are_not_to_be_patched(target: Targe
     said = explain_fallback("some_extension", tmp_path)
     assert f"does not fit its sources in {target.folder}: `lapgs patch status {tmp_path}` says where" in said
     assert "lapgs patch apply" not in said
+
+
+def test_of_several_checkouts_none_is_said_to_be_the_installed_one(
+    target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = replace(target, folder=Path(shutil.copytree(target.folder, tmp_path / "other")))
+    monkeypatch.setattr(signed_color, "find_targets", lambda _: (other, target))
+    said = explain_fallback("some_extension", tmp_path)
+    assert "`lapgs patch apply CHECKOUT`" in said
+    assert str(tmp_path) not in said
 
 
 def test_sources_of_another_module_say_nothing_about_this_one(target: Target, tmp_path: Path) -> None:
