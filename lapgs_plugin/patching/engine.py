@@ -75,7 +75,7 @@ class SetStatus:
 
 
 def find_targets(checkout: Path) -> tuple[Target, ...]:
-    """Return the known extensions in a checkout: the folder itself, or folders up to `DEPTH` levels below it.
+    """Return the known extensions in a checkout, each once: the folder itself, or folders up to `DEPTH` levels below.
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
@@ -87,14 +87,16 @@ def find_targets(checkout: Path) -> tuple[Target, ...]:
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
     recipes = load_recipes()
     folders = [checkout, *sorted(_subfolders(checkout))]
-    targets = tuple(Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder))
+    targets = [Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder)]
     if not targets:
         known = ", ".join(recipe.name for recipe in recipes)
         raise PatchError(
             f"{checkout}: no rasterizer that is known in this folder (known: {known}); are its submodules checked out? "
             "`lapgs help patches` says how to add one"
         )
-    return targets
+    # A link to another folder of the checkout is no second rasterizer to build.
+    unique = {(target.recipe.name, target.folder.resolve()): target for target in reversed(targets)}
+    return tuple(reversed(unique.values()))
 
 
 def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:

@@ -896,6 +896,13 @@ def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, dep
     assert (target.recipe.name, target.folder) == ("graphdeco", rasterizer)
 
 
+def test_a_rasterizer_that_a_link_leads_to_is_one(rasterizer: Path) -> None:
+    checkout = rasterizer.parents[1]
+    (checkout / "raster").symlink_to(rasterizer)
+    (checkout / "elsewhere").symlink_to(shutil.copytree(rasterizer, checkout.parent / "other"))
+    assert [target.folder for target in find_targets(checkout)] == [checkout / "elsewhere", checkout / "raster"]
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has other permissions")
 def test_a_folder_that_may_not_be_read_is_no_rasterizer(rasterizer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As lost+found, or what another user's container wrote into the checkout."""
