@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+import io
+import os
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -58,12 +60,12 @@ AllowDirty = Annotated[bool, typer.Option("--allow-dirty", help="Also edit files
 @app.command("status")
 def status_(checkout: Checkout, set_name: SetName = "all") -> None:
     """Show which edits are applied, which can be applied, and why others cannot."""
-    chosen = _targets(checkout, set_name, opt_in=True)
-    with _alone(chosen):
-        for target, sets in chosen:
+    targets = _targets(checkout, set_name)
+    with _alone(targets):
+        for target in targets:
             say(f"{target.folder}: {target.recipe.title}")
             for edits in status(target):
-                if edits.set not in sets:
+                if set_name not in (ALL_SETS, edits.set):
                     continue
                 say(f"  {edits.set:14} {edits.state.value}")
                 for problem in edits.problems:
@@ -78,7 +80,7 @@ def status_(checkout: Checkout, set_name: SetName = "all") -> None:
 @app.command("diff")
 def diff(checkout: Checkout, set_name: SetName = "all") -> None:
     """Print the changes of `lapgs patch apply` as a unified diff."""
-    changes = [change for _, change in _planned(_targets(checkout, set_name, opt_in=False))]
+    changes = [change for _, change in _planned(plan_apply, _targets(checkout, set_name), set_name)]
     if not changes:
         say(f"{checkout}: nothing to apply, these edits are applied already: {set_name}", stderr=True)
     for change in changes:
@@ -91,9 +93,9 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
 
     Reinstall the extension afterwards with the command that is printed.
     """
-    chosen = _targets(checkout, set_name, opt_in=False)
-    with _alone(chosen):
-        planned = _planned(chosen)
+    targets = _targets(checkout, set_name)
+    with _alone(targets):
+        planned = _planned(plan_apply, targets, set_name)
         if planned:
             _write("patched", planned, allow_dirty)
         else:
@@ -103,9 +105,9 @@ def apply(checkout: Checkout, set_name: SetName = "all", allow_dirty: AllowDirty
 @app.command("revert")
 def revert(checkout: Checkout, set_name: SetName = "all") -> None:
     """Remove the edits; your own changes in the same files stay."""
-    chosen = _targets(checkout, set_name, opt_in=True)
-    with _alone(chosen):
-        planned = [(target, change) for target, sets in chosen for change in plan_revert(target, sets)]
+    targets = _targets(checkout, set_name)
+    with _alone(targets):
+        planned = _planned(plan_revert, targets, set_name)
         if planned:
             _write("reverted", planned, allow_dirty=True)
         else:
@@ -113,36 +115,27 @@ def revert(checkout: Checkout, set_name: SetName = "all") -> None:
 
 
 @contextmanager
-def _alone(chosen: Sequence[tuple[Target, Collection[str]]]) -> Iterator[None]:
+def _alone(targets: Sequence[Target]) -> Iterator[None]:
     """Lock out other `lapgs patch` processes, and remove files that a killed one left."""
-    with alone(target for target, _ in chosen) as stuck:
+    with alone(targets) as stuck:
         for path in stuck:
             say(f"a killed `lapgs patch` left {path}, which cannot be removed", stderr=True)
         yield
 
 
-def _targets(checkout: Path, set_name: str, *, opt_in: bool) -> list[tuple[Target, tuple[str, ...]]]:
-    """Return the extensions in the checkout that have the wanted edits, each with its sets of edits.
-
-    Args:
-        checkout, set_name: as the commands take them.
-        opt_in: whether "all" includes the sets that must be named otherwise.
-    """
+def _targets(checkout: Path, set_name: str) -> list[Target]:
+    """Return the extensions in the checkout that have the wanted set of edits."""
     targets = find_targets(checkout)
     known = sorted({name for target in targets for name in target.recipe.sets})
     if set_name not in (ALL_SETS, *known):
         raise PatchError(f"--set {set_name}: expected one of {', '.join([*known, ALL_SETS])} for {checkout}")
-    chosen = []
-    for target in targets:
-        everything = target.recipe.sets if opt_in else target.recipe.default_sets
-        sets = everything if set_name == ALL_SETS else tuple(name for name in target.recipe.sets if name == set_name)
-        if sets:
-            chosen.append((target, sets))
-    return chosen
+    return [target for target in targets if set_name in (ALL_SETS, *target.recipe.sets)]
 
 
-def _planned(chosen: Sequence[tuple[Target, Collection[str]]]) -> list[tuple[Target, FileChange]]:
-    return [(target, change) for target, sets in chosen for change in plan_apply(target, sets)]
+def _planned(
+    plan: Callable[[Target, Collection[str]], tuple[FileChange, ...]], targets: Sequence[Target], set_name: str
+) -> list[tuple[Target, FileChange]]:
+    return [(target, change) for target in targets for change in plan(target, [set_name])]
 
 
 def _write(verb: str, planned: Sequence[tuple[Target, FileChange]], allow_dirty: bool) -> None:
@@ -171,7 +164,10 @@ def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
 
 
-def _unified(change: FileChange, checkout: Path) -> str:
+def _unified(change: FileChange, checkout: Path) -> bytes:
+    """Return a diff that `git apply` takes, in the encoding and with the line endings of the file."""
     name = change.path.relative_to(checkout).as_posix()
-    before, after = (data.decode("utf-8", "replace").split("\n") for data in (change.before, change.after))
-    return "".join(f"{line}\n" for line in difflib.unified_diff(before, after, f"a/{name}", f"b/{name}", lineterm=""))
+    before, after = (io.BytesIO(data).readlines() for data in (change.before, change.after))
+    old, new = (os.fsencode(f"{side}/{name}") for side in "ab")
+    lines = difflib.diff_bytes(difflib.unified_diff, before, after, old, new)
+    return b"".join(line if line.endswith(b"\n") else line + b"\n\\ No newline at end of file\n" for line in lines)

@@ -21,9 +21,10 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 _HEAD = r">>> lapgs (?P<{0}set>[\w-]+)/(?P<{0}name>[\w-]+) (?P<{0}sum>[0-9a-f]{{8}})"
+_BODY = r"(?P<{0}body>(?:(?!>>> lapgs ).)*?)"  # a block that lacks its end must not hide the next one
 _BLOCK = re.compile(
-    r"^[ \t]*// " + _HEAD.format("l_") + r"[ \t]*\r?\n(?P<l_body>.*?)^[ \t]*// <<< lapgs[ \t]*(?:\r?\n|\Z)"
-    r"|/\*" + _HEAD.format("c_") + r"(?: was: (?P<was>.*?))?\*/(?P<c_body>.*?)/\*<<< lapgs\*/",
+    r"^[ \t]*// " + _HEAD.format("l_") + r"[ \t]*\r?\n" + _BODY.format("l_") + r"^[ \t]*// <<< lapgs[ \t]*(?:\r?\n|\Z)"
+    r"|/\*" + _HEAD.format("c_") + r"(?: was: (?P<was>.*?))?\*/" + _BODY.format("c_") + r"/\*<<< lapgs\*/",
     re.MULTILINE | re.DOTALL,
 )
 _MARKER = re.compile(r">>> lapgs |<<< lapgs")

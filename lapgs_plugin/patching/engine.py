@@ -19,7 +19,7 @@ from lapgs_plugin.patching.recipe import Anchor, Check, Edit, Recipe, load_recip
 from lapgs_plugin.patching.tokens import Token, definitions, occurrences, tokenize, unconditional
 
 ALL_SETS = "all"
-"""Name for all sets to revert, or for all to apply that are not opt-in."""
+"""Name for all sets in the sources, to revert, or for all of the recipe that are not opt-in, to apply."""
 
 DEPTH = 4
 """Depth of folders below a checkout at which extensions are searched, enough for a checkout inside another one."""
@@ -43,7 +43,7 @@ class Target:
     @property
     def reinstall(self) -> str:
         """The command that builds and installs it again."""
-        return self.recipe.reinstall.format(folder=as_pip_argument(self.folder))
+        return self.recipe.reinstall.replace("{folder}", as_pip_argument(self.folder))  # ${NAMES} of shells stay
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class SetStatus:
 
 
 def find_targets(checkout: Path) -> tuple[Target, ...]:
-    """Return the known extensions in a checkout: the folder itself, or folders up to `DEPTH` levels below it.
+    """Return the known extensions in a checkout, each once: the folder itself, or folders up to `DEPTH` levels below.
 
     Args:
         checkout: a backbone's repository, or the folder of one extension.
@@ -87,14 +87,16 @@ def find_targets(checkout: Path) -> tuple[Target, ...]:
         raise PatchError(f"{checkout}: no such folder, expected a backbone's checkout or its rasterizer's folder")
     recipes = load_recipes()
     folders = [checkout, *sorted(_subfolders(checkout))]
-    targets = tuple(Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder))
+    targets = [Target(recipe, folder) for folder in folders for recipe in recipes if recipe.recognises(folder)]
     if not targets:
         known = ", ".join(recipe.name for recipe in recipes)
         raise PatchError(
             f"{checkout}: no rasterizer that is known in this folder (known: {known}); are its submodules checked out? "
             "`lapgs help patches` says how to add one"
         )
-    return targets
+    # A link to another folder of the checkout is no second rasterizer to build.
+    unique = {(target.recipe.name, target.folder.resolve()): target for target in reversed(targets)}
+    return tuple(reversed(unique.values()))
 
 
 def plan_apply(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]:
@@ -115,7 +117,7 @@ def plan_revert(target: Target, sets: Collection[str]) -> tuple[FileChange, ...]
         PatchError: a block was changed after it was written.
     """
     sources = _read(target)
-    sets = frozenset(target.recipe.sets if ALL_SETS in sets else sets)
+    sets = _present_sets(sources.values()) if ALL_SETS in sets else frozenset(sets)
     _refuse(target, [problem for file, source in sources.items() for problem in _damage(file, source, sets)])
     after = {file: without_blocks(source, sets) for file, source in sources.items()}
     return _changes(target, sources, after)
@@ -169,7 +171,9 @@ def _try_apply(target: Target, sets: Collection[str]) -> tuple[tuple[FileChange,
     recipe, sources = target.recipe, _read(target)
     wanted = frozenset(recipe.default_sets if ALL_SETS in sets else sets) | _present_sets(sources.values())
     problems = [
-        f"{name} is not among its sets of edits ({', '.join(recipe.sets)})" for name in sorted(wanted - {*recipe.sets})
+        f"{name} is not among its sets of edits ({', '.join(recipe.sets)}); if another version of lapgs applied it, "
+        "take it out with `lapgs patch revert`"
+        for name in sorted(wanted - {*recipe.sets})
     ]
     after = {}
     for file in recipe.files:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from lapgs_plugin.errors import PatchError
@@ -31,7 +31,7 @@ def read_only(changes: Iterable[FileChange]) -> list[Path]:
 
 
 def uncommitted(paths: Iterable[Path]) -> list[Path]:
-    """Return the files that differ from their last commit in git in more than our own edits.
+    """Return the files that differ from their last commit in git in more than our own edits, committed or not.
 
     Each file is looked up in the repository that it belongs to, which may be a submodule. Files that git does not
     track, and all files without git, are left out.
@@ -69,7 +69,7 @@ def alone(targets: Iterable[Target]) -> Iterator[list[Path]]:
 def write_all(changes: Sequence[FileChange]) -> None:
     """Write every file through a temporary file beside it; on failure restore the files written so far.
 
-    Permissions are kept, links are followed.
+    Permissions are kept, and the owner where this user may set it; links are followed.
 
     Raises:
         PatchError: a file could not be written, or was changed after the change was planned.
@@ -127,7 +127,7 @@ def _folder_lock(folder: Path) -> Iterator[bool]:
 
 
 def _beside(path: Path, data: bytes) -> Path:
-    """Write a new file in the same folder with the permissions of `path`, and return its path."""
+    """Write a new file in the same folder with the owner and permissions of `path`, and return its path."""
     target = path.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=_SUFFIX)
     temporary = Path(name)
@@ -136,6 +136,9 @@ def _beside(path: Path, data: bytes) -> Path:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
+        if sys.platform != "win32":
+            with suppress(OSError):  # only root may; in a container it writes to checkouts of others
+                os.chown(temporary, target.stat().st_uid, target.stat().st_gid)
         shutil.copymode(target, temporary)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -154,15 +157,19 @@ def _put_back(change: FileChange) -> bool:
 
 
 def _differs_from_head(path: Path) -> bool:
-    committed = _git(path, "rev-parse", "--verify", "--quiet", f"HEAD:./{path.resolve().name}")
+    name = path.resolve().name
+    committed, current = _git(path, "cat-file", "blob", f"HEAD:./{name}"), path.read_bytes()
     if committed is None:
         return False
-    # hash-object applies git's conversions on commit, such as CRLF to LF.
-    current = _git(path, "hash-object", "--stdin", "--path", path.resolve().name, stdin=pristine(path.read_bytes()))
-    return current is not None and current != committed
+    before, after = pristine(committed), pristine(current)
+    if before == after:  # git, too, leaves CRLF as they are in files that were committed with them
+        return False
+    # With a path hash-object applies git's conversions on commit, such as CRLF to LF.
+    converted = _git(path, "hash-object", "--stdin", "--path", name, stdin=after)
+    return converted is not None and converted != _git(path, "hash-object", "--stdin", stdin=before)
 
 
-def _git(path: Path, *arguments: str, stdin: bytes = b"") -> str | None:
+def _git(path: Path, *arguments: str, stdin: bytes = b"") -> bytes | None:
     """Return the output of a git command in the file's folder, or None if it fails."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
@@ -176,4 +183,4 @@ def _git(path: Path, *arguments: str, stdin: bytes = b"") -> str | None:
         )
     except OSError:
         return None
-    return result.stdout.decode().strip() if result.returncode == 0 else None
+    return result.stdout if result.returncode == 0 else None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from lapgs_plugin.errors import PatchError
-from lapgs_plugin.files import shipped
+from lapgs_plugin.files import is_file, shipped
 from lapgs_plugin.patching.tokens import occurrences, tokenize
 from lapgs_plugin.untrusted import STRICT, read_toml, shortened
 
@@ -58,6 +59,9 @@ class Edit:
 
     def __post_init__(self) -> None:
         _require_tokens(self.find)
+        for name in (self.set, self.name):
+            if not re.fullmatch(r"[\w-]+", name, re.ASCII):  # others would not be found again in the blocks of a file
+                raise ValueError(f"{shortened(name)} is no name of a set or an edit, expected letters, digits, _ and -")
         if (self.before is None) == (self.replace is None):
             raise ValueError(f"{self.name!r} has both or none, expected either `before` or `replace`")
         if not self.put.isascii():
@@ -192,7 +196,7 @@ def read_source(path: Path) -> str:
 
 def _stands(anchor: Anchor, folder: Path) -> bool:
     path = folder / anchor.file
-    if not path.is_file():
+    if not is_file(path):  # a folder that this user may not search, such as lost+found, has none
         return False
     tokens = tokenize(read_source(path)) if anchor.find else []
     return not anchor.find or bool(occurrences(tokens, anchor.find, range(len(tokens))))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+import shlex
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -118,10 +118,12 @@ def has_signed_color(extension: CudaExtension) -> bool:
         unseen = extension.render(field, camera, background=white, sh_degree=0, colors=black).image[0]  # (h, w)
     weight = 1 - unseen  # of the only Gaussian
     image_error = (result.image.detach() - weight * expected[:, None, None]).abs().max()
-    # The image is weight * C0 * sh_0 in each channel, so all channels have the same gradient unless the negative ones
-    # were clamped. Its size is not tested: a backward pass that loses part of it does not make colours wrong.
+    # The image is weight * C0 * (sh_0 + sqrt(3) sh_2) in each channel, so these gradients are the same unless negative
+    # channels were clamped, or only the forward pass was patched and the other one takes the degree for 0. Their size
+    # is not tested: a backward pass that loses part of it does not make colours wrong.
     slope = float(weight.sum()) / math.sqrt(4 * math.pi)
-    spread = float(gradient[0, 0].max() - gradient[0, 0].min())
+    slopes = torch.stack([gradient[0, 0], gradient[0, 2] / math.sqrt(3)])  # (2, 3)
+    spread = float(slopes.max() - slopes.min())
     return bool(image_error <= PROBE_TOLERANCE) and slope > 0 and spread <= PROBE_TOLERANCE * slope
 
 
@@ -152,7 +154,7 @@ def explain_fallback(module: str, checkout: Path) -> str:
     slow = (
         f"{module} has no signed colour: residual fields are rendered with SH evaluated in PyTorch, correct but slower"
     )
-    target = next(_sources(module, checkout), None)
+    target = _source(module, checkout)
     if target is None:
         return f"{slow}; `lapgs patch apply CHECKOUT` on the sources it was built from, then reinstall it"
     state = {patches.set: patches.state for patches in status(target)}.get(SIGNED_COLOR_SET)
@@ -161,13 +163,19 @@ def explain_fallback(module: str, checkout: Path) -> str:
             f"{slow}; its sources in {target.folder} are patched, but the installed build is older: run "
             f"`{target.reinstall}`"
         )
-    return f"{slow}; run `lapgs patch apply {checkout}` and then `{target.reinstall}`"
+    if state is State.IMPOSSIBLE:
+        return (
+            f"{slow}; the patch does not fit its sources in {target.folder}: `lapgs patch status "
+            f"{shlex.quote(str(checkout))}` says where"
+        )
+    return f"{slow}; run `lapgs patch apply {shlex.quote(str(checkout))}` and then `{target.reinstall}`"
 
 
-def _sources(module: str, checkout: Path) -> Iterator[Target]:
-    """Yield the known extensions in the checkout that install this module."""
+def _source(module: str, checkout: Path) -> Target | None:
+    """Return the extension in the checkout that installs this module; None if there is none, or more than one."""
     try:
         targets = find_targets(checkout)
     except PatchError:  # no checkout with a rasterizer: the message is then more general
-        return
-    yield from (target for target in targets if (target.folder / module).is_dir())
+        return None
+    sources = [target for target in targets if (target.folder / module).is_dir()]
+    return sources[0] if len(sources) == 1 else None  # a folder of several checkouts

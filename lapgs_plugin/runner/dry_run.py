@@ -350,12 +350,15 @@ class DryRun:
             f"residual could not subtract; {NESTED_WORKS}"
         )
 
-    def _colored(self, view: Any, gaussians: Any, path: ColorPath) -> tuple[Tensor, Tensor]:
-        """Return the image of a residual and the gradient of its sum by the first SH coefficients."""
+    def _colored(self, view: Any, gaussians: Any, path: ColorPath) -> tuple[Tensor, ...]:
+        """Return the image of a residual and the gradients of its sum by the SH coefficients.
+
+        Those above the first are lost where only the forward pass of a rasterizer was patched.
+        """
         with torch.enable_grad():
             image = self._render(view, gaussians, path).image
-            (gradient,) = torch.autograd.grad(image.sum(), gaussians._features_dc, allow_unused=True)
-        return image.detach(), torch.zeros_like(gaussians._features_dc) if gradient is None else gradient
+            sh = gaussians._features_dc, gaussians._features_rest
+            return image.detach(), *torch.autograd.grad(image.sum(), sh, allow_unused=True, materialize_grads=True)
 
     @contextmanager
     def _step(self, what: str, expected: str, works: str) -> Iterator[None]:

@@ -17,6 +17,7 @@ import torch
 
 from lapgs_plugin.errors import DeviceMemoryError, UserInputError
 from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.rasterizers.signed_color import signed_degree
 from lapgs_plugin.runner import dry_run
 from lapgs_plugin.runner.stage_views import StageViews
 from lapgs_plugin.runs.archive import RunArchive
@@ -25,6 +26,7 @@ from tests.contract.stub_runs import (
     NAMES,
     STUBS,
     Result,
+    StopAt,
     captured,
     drive,
     edited_graphdeco,
@@ -145,6 +147,30 @@ def test_what_fails_is_one_line_with_its_place(failure: str, scene: Path, tmp_pa
         drive(adapter, dry_run=True, hierarchy="laplacian" if failure.startswith("residuals") else "nested")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_rasterizer_whose_backward_pass_is_not_patched_gets_colours(
+    whole: bool, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It takes the degree of a signed call for 0, as one that does not know the flag."""
+    with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT) as adapter:
+        kind = sys.modules["diff_gaussian_rasterization"].GaussianRasterizer
+        forward = kind.forward
+
+        def half_patched(self: Any, *arguments: Any, **inputs: Any) -> Any:
+            image, *others = forward(self, *arguments, **inputs)
+            if whole or self.raster_settings.sh_degree >= 0:
+                return image, *others
+            constant = kind(self.raster_settings._replace(sh_degree=signed_degree(0)))
+            differentiable = forward(constant, *arguments, **inputs)[0]
+            return image.detach() + differentiable - differentiable.detach(), *others
+
+        kind.forward = half_patched
+        with pytest.raises(KeyboardInterrupt):
+            drive(adapter, hooks=(StopAt(1),), hierarchy="laplacian")
+    warned = ["diff_gaussian_rasterization has no signed colour" in record.getMessage() for record in caplog.records]
+    assert any(warned) is not whole
 
 
 def test_a_gpu_that_is_full_already_costs_no_run(scene: Path, tmp_path: Path) -> None:

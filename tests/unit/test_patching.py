@@ -349,10 +349,12 @@ def test_a_block_that_was_only_reformatted_can_be_taken_out(target: Target) -> N
 def test_half_a_block_is_refused(target: Target, marker: bytes) -> None:
     apply(target, ALL_SETS)
     path = target.folder / SHADE
-    head, tail = path.read_bytes().rsplit(marker, 1)
-    path.write_bytes(head + tail)
-    for plan in (plan_apply, plan_revert):
-        refuses(PatchError, "half a lapgs block", plan, target, [ALL_SETS])
+    source = path.read_bytes()
+    for parts in (source.split(marker, 1), source.rsplit(marker, 1)):
+        path.write_bytes(b"".join(parts))
+        for plan in (plan_apply, plan_revert):
+            for name in (ALL_SETS, *RECIPE.sets):
+                refuses(PatchError, "half a lapgs block", plan, target, [name])
 
 
 def test_states(target: Target) -> None:
@@ -389,7 +391,8 @@ def test_edits_of_another_version_are_renewed(target: Target, tree: dict[str, by
     renewed = apply(target, "signed")
     assert renewed == apply(write_tree(target.folder, tree), "signed")
     newer = replace(RECIPE, edit=(EDITS["guard"],))
-    refuses(PatchError, "signed is not among its sets of edits", plan_apply, Target(newer, target.folder), ["build"])
+    facts = "signed is not among its sets of edits.*`lapgs patch revert`"
+    refuses(PatchError, facts, plan_apply, Target(newer, target.folder), ["build"])
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -437,6 +440,16 @@ def test_permissions_and_links_stay(target: Target, tmp_path: Path) -> None:
     assert stat.S_IMODE(moved.stat().st_mode) == 0o755
 
 
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may give files away")
+def test_files_of_others_stay_theirs(target: Target) -> None:
+    """As after `lapgs patch apply` in a container that has somebody's checkout mounted."""
+    files = [target.folder / file for file in PROGRAMS]
+    for path in files:
+        os.chown(path, 1234, 4321)
+    apply(target, ALL_SETS)
+    assert [(path.stat().st_uid, path.stat().st_gid) for path in files] == [(1234, 4321)] * 2
+
+
 def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> None:
     changes = plan_apply(target, [ALL_SETS])
     assert read_only(changes) == []
@@ -449,9 +462,9 @@ def test_read_only_files_and_folders_are_found_even_by_root(target: Target) -> N
         folder.chmod(0o755)
 
 
-def git(folder: Path, *arguments: str) -> None:
+def git(folder: Path, *arguments: str) -> bytes:
     identity = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "protocol.file.allow=always")
-    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
+    return subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True).stdout
 
 
 @pytest.mark.parametrize("autocrlf", ["false", "true"])
@@ -475,6 +488,39 @@ def test_uncommitted_changes_are_those_that_are_not_ours(target: Target, tmp_pat
     files[1].write_bytes(files[1].read_bytes() + b"// mine\n")
     assert uncommitted(files) == [files[1]]
     git(inner.folder, "add", ".")
+    assert uncommitted(files) == [files[1]]
+
+
+def test_committed_edits_are_no_uncommitted_changes(target: Target) -> None:
+    git(target.folder, "init")
+    files = [target.folder / file for file in PROGRAMS]
+    apply(target, "signed")
+    git(target.folder, "add", ".")
+    git(target.folder, "commit", "-m", "patched")
+    assert uncommitted(files) == []
+    apply(target, "build")
+    assert uncommitted(files) == []
+    revert(target, ALL_SETS)
+    assert uncommitted(files) == []
+    files[1].write_bytes(files[1].read_bytes() + b"// mine\n")
+    assert uncommitted(files) == [files[1]]
+
+
+@pytest.mark.parametrize("autocrlf", ["true", "input"])
+def test_line_endings_that_git_leaves_alone_are_no_uncommitted_changes(target: Target, autocrlf: str) -> None:
+    """A file that was committed with CRLF is not converted."""
+    files = [target.folder / file for file in PROGRAMS]
+    for path in files:
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    git(target.folder, "init")
+    git(target.folder, "-c", "core.autocrlf=false", "add", ".")
+    git(target.folder, "commit", "-m", "all")
+    git(target.folder, "config", "core.autocrlf", autocrlf)
+    assert git(target.folder, "status", "--short") == b""
+    assert uncommitted(files) == []
+    apply(target, ALL_SETS)
+    assert uncommitted(files) == []
+    files[1].write_bytes(files[1].read_bytes() + b"// mine\r\n")
     assert uncommitted(files) == [files[1]]
 
 
@@ -850,6 +896,30 @@ def test_a_checkout_is_the_rasterizer_or_a_folder_above_it(rasterizer: Path, dep
     assert (target.recipe.name, target.folder) == ("graphdeco", rasterizer)
 
 
+def test_a_rasterizer_that_a_link_leads_to_is_one(rasterizer: Path) -> None:
+    checkout = rasterizer.parents[1]
+    (checkout / "raster").symlink_to(rasterizer)
+    (checkout / "elsewhere").symlink_to(shutil.copytree(rasterizer, checkout.parent / "other"))
+    assert [target.folder for target in find_targets(checkout)] == [checkout / "elsewhere", checkout / "raster"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has other permissions")
+def test_a_folder_that_may_not_be_read_is_no_rasterizer(rasterizer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As lost+found, or what another user's container wrote into the checkout."""
+    folder = rasterizer / "output"
+    folder.mkdir(mode=0)
+    recipes = load_recipes()
+    monkeypatch.chdir(rasterizer)  # whose parents are root's alone
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(1234)
+    try:
+        assert [recipe.name for recipe in recipes if recipe.recognises(Path())] == ["graphdeco"]
+        assert not any(recipe.recognises(Path("output")) for recipe in recipes)
+    finally:
+        os.seteuid(user)
+
+
 def test_a_folder_without_a_rasterizer_is_an_error(tmp_path: Path) -> None:
     refuses(PatchError, r"known: .*graphdeco.*are its submodules checked out\?", find_targets, tmp_path)
     refuses(PatchError, "no such folder", find_targets, tmp_path / "missing")
@@ -874,6 +944,8 @@ EDIT = HEAD + '[[edit]]\nset = "a"\nname = "b"\nfile = "c"\n'
         (HEAD.replace("[]", "[3]"), "present[0] is 3"),
         (EDIT + 'find = "d"\nbefore = "e"\nunless = ["include"]', "directives that start with #"),
         (EDIT + 'find = " "\nbefore = "e"', "nothing to find"),
+        (EDIT.replace('"a"', '"a b"') + 'find = "d"\nbefore = "e"', "'a b' is no name of a set or an edit"),
+        (EDIT.replace('"b"', '"a.b"') + 'find = "d"\nbefore = "e"', "'a.b' is no name of a set or an edit"),
     ],
 )
 def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -884,13 +956,15 @@ def test_a_recipe_with_a_mistake_is_named(tmp_path: Path, text: str, message: st
 def test_a_recipe_takes_over_the_edits_of_the_one_it_extends(tmp_path: Path) -> None:
     edit = '[[edit]]\nset = "a"\nname = "{}"\nfile = "c"\nfind = "d"\nbefore = "{}"\n'
     head = 'name = "{}"\ntitle = "T"\npresent = [{{ file = "{}" }}]\n'
-    base = head.format("base", "x") + 'reinstall = "make {folder}"\n' + edit.format("one", 1) + edit.format("two", 2)
+    reinstall = "CUDA_HOME=${CUDA} make {folder}"
+    base = head.format("base", "x") + f'reinstall = "{reinstall}"\n' + edit.format("one", 1) + edit.format("two", 2)
     child = head.format("child", "y") + 'extends = "base"\n' + edit.format("one", 3) + edit.format("three", 4)
     (tmp_path / "base.toml").write_text(base)
     (tmp_path / "child.toml").write_text(child)
     recipe = load_recipes(tmp_path)[1]
+    assert Target(recipe, Path("/here")).reinstall == "CUDA_HOME=${CUDA} make /here"
     assert [(e.name, e.put) for e in recipe.edit] == [("one", "3"), ("two", "2"), ("three", "4")]
-    assert (recipe.present, recipe.reinstall) == ((Anchor("y"),), "make {folder}")
+    assert (recipe.present, recipe.reinstall) == ((Anchor("y"),), reinstall)
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -929,6 +1003,32 @@ def test_the_command_from_status_to_revert(rasterizer: Path) -> None:
     lapgs_patch("revert", checkout)
     assert snapshot(checkout) == pristine
     assert "nothing to remove" in lapgs_patch("revert", checkout)
+
+
+def test_revert_takes_out_sets_that_only_another_version_has(rasterizer: Path) -> None:
+    pristine = snapshot(rasterizer)
+    lapgs_patch("apply", rasterizer)
+    header = rasterizer / "cuda_rasterizer/rasterizer_impl.h"
+    header.write_text(header.read_text().replace("build-cuda13/", "build-cuda14/"))
+    lapgs_patch("revert", rasterizer)
+    assert snapshot(rasterizer) == pristine
+
+
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("last", [b"\n", b""])
+def test_git_applies_the_diff(rasterizer: Path, ending: bytes, last: bytes) -> None:
+    """Also where an edit is near the end of a file, and where comments are no UTF-8."""
+    for path in rasterizer.rglob("*.[ch]*"):
+        text = path.read_bytes().replace(b"result += 0.5f;", b"result += 0.5f; // \xd6\xd0")
+        path.write_bytes((text.rstrip(b"\n") + last).replace(b"\n", ending))
+    command = [sys.executable, "-m", "lapgs_plugin", "patch", "diff", str(rasterizer)]
+    diff = subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
+    (rasterizer.parent / "lapgs.diff").write_bytes(diff.stdout)
+    git(rasterizer, "apply", "../lapgs.diff")
+    applied = snapshot(rasterizer)
+    git(rasterizer, "apply", "--reverse", "../lapgs.diff")
+    lapgs_patch("apply", rasterizer)
+    assert snapshot(rasterizer) == applied
 
 
 @pytest.mark.parametrize("inside", ["ms/train.py", "ms"])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
+import shlex
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -82,6 +85,15 @@ class PatchedForward(Patched):
         return replace(right, image=right.image.detach() + clamped.image - clamped.image.detach())
 
 
+class PatchedForwardAlone(Patched):
+    """An extension whose backward pass was not patched: it takes the degree for 0."""
+
+    def with_sh(self, field: GaussianField, camera: Camera, background: Tensor, sh_degree: int) -> RenderResult:
+        right = super().with_sh(field, camera, background, sh_degree)
+        constant = super().with_sh(field, camera, background, sh_degree & SIGNED_COLOR_BIT)
+        return replace(right, image=right.image.detach() + constant.image - constant.image.detach())
+
+
 class AlwaysSigned(Unpatched):
     """An extension that takes the degree for 0."""
 
@@ -89,14 +101,9 @@ class AlwaysSigned(Unpatched):
         return ORACLE(replace(field, signed=True), camera, background=background, sh_degree=0)
 
 
-def test_the_flag_is_the_sign_bit_and_leaves_the_degree() -> None:
-    for degree in range(4):
-        assert signed_degree(degree) < 0
-        assert signed_degree(degree) & ~SIGNED_COLOR_BIT == degree
-
-
 @pytest.mark.parametrize(
-    ("extension", "native"), [(Unpatched, False), (Patched, True), (PatchedForward, False), (AlwaysSigned, False)]
+    ("extension", "native"),
+    [(Unpatched, False), (Patched, True), (PatchedForward, False), (PatchedForwardAlone, False), (AlwaysSigned, False)],
 )
 def test_the_probe_finds_out_what_an_extension_does(extension: type[Unpatched], native: bool) -> None:
     assert has_signed_color(extension()) is native
@@ -176,12 +183,35 @@ def test_unpatched_sources_are_to_be_patched(target: Target, tmp_path: Path) -> 
     assert f"run `lapgs patch apply {tmp_path}` and then `pip install {target.folder}`" in said
 
 
+def test_the_command_can_be_pasted_where_names_have_spaces(target: Target, tmp_path: Path) -> None:
+    folder = tmp_path / "my code"
+    (command,) = re.findall("`(lapgs patch apply .*?)`", explain_fallback("some_extension", folder))
+    assert shlex.split(command) == ["lapgs", "patch", "apply", str(folder)]
+
+
 def test_patched_sources_beside_an_old_build_are_said_to_be_stale(target: Target, tmp_path: Path) -> None:
     write_all(plan_apply(target, ["signed-color"]))
     said = explain_fallback("some_extension", tmp_path)
     assert f"sources in {target.folder} are patched, but the installed build is older" in said
     assert f"run `pip install {target.folder}`" in said
     assert "lapgs patch" not in said
+
+
+def test_sources_that_the_patch_does_not_fit_are_not_to_be_patched(target: Target, tmp_path: Path) -> None:
+    (target.folder / "shade.cu").write_text("float shade() { return 0.25f; }\n")
+    said = explain_fallback("some_extension", tmp_path)
+    assert f"does not fit its sources in {target.folder}: `lapgs patch status {tmp_path}` says where" in said
+    assert "lapgs patch apply" not in said
+
+
+def test_of_several_checkouts_none_is_said_to_be_the_installed_one(
+    target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = replace(target, folder=Path(shutil.copytree(target.folder, tmp_path / "other")))
+    monkeypatch.setattr(signed_color, "find_targets", lambda _: (other, target))
+    said = explain_fallback("some_extension", tmp_path)
+    assert "`lapgs patch apply CHECKOUT`" in said
+    assert str(tmp_path) not in said
 
 
 def test_sources_of_another_module_say_nothing_about_this_one(target: Target, tmp_path: Path) -> None:
