@@ -106,8 +106,8 @@ class Densification:
         AUTO,
         "How Gaussians are added and removed: mcmc (Kheradmand et al. 2024), 3dgs (clone, split and prune as 3DGS "
         "does), multiview (the same, only where several views have large errors), or one of an installed package. "
-        f"auto: mcmc from {LONG_RUN} iterations on, with large photos from {LONG_RUN_OF_LARGE}, else 3dgs; an option that "
-        "only one of the two has chooses it.",
+        f"auto: mcmc from {LONG_RUN} iterations on, with large photos from {LONG_RUN_OF_LARGE}, else 3dgs; an option "
+        "that only one of the two has chooses it.",
         panel=PANEL,
     )
     start: int | None = option(
