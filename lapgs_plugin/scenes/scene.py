@@ -342,15 +342,21 @@ def _within_lens(mask: Tensor | None, camera: Camera, path: Path) -> Tensor | No
     return rest
 
 
-def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = True) -> list[View]:
-    """Return views whose images are in memory; `progress` as `load_scene` takes it.
+def held_views(views: Sequence[View], *, hold: bool = True, progress: bool | ProgressCallback = True) -> list[View]:
+    """Read the images of views and return the views with them in memory.
+
+    Args:
+        views: to read.
+        hold: without it, images are only read once, to find out whether they can be, and views returned as they are.
+        progress: as `load_scene` takes it.
 
     Raises:
         SceneError: an image or a mask cannot be read.
     """
 
     def held(view: View) -> View:
-        return View(view.name, view.camera, view.image, view.mask, view.sky)
+        read = View(view.name, view.camera, view.image, view.mask, view.sky)
+        return read if hold else view
 
     readers = readers_of(view.camera.size for view in views)
     return in_threads("Reading images", "images", held, views, most=readers, progress=progress)

@@ -32,7 +32,8 @@ from lapgs_plugin.training.strategies import Gradients
 from lapgs_plugin.training.trainer import Trainer
 from tests import ranks
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import write_scene
+from tests.cli.run_folder import write_run, write_scene
+from tests.folders import snapshot
 from tests.refusals import refuses
 from tests.training_runs import plys
 from tests.training_scene import blob_field
@@ -163,6 +164,18 @@ def test_why_one_rank_cannot_go_on_is_said_by_rank_0_alone(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_rank_that_is_stopped_says_nothing(scene: Path, tmp_path: Path) -> None:
+    """torchrun's agent stops the other ranks when one has failed."""
+    started = ranks.start("lapgs_plugin", [["help"], ["train", scene, "-o", tmp_path / "run"]])
+    waits = Path(f"/proc/{started[1].pid}/status")
+    wait_for(lambda: bool(int(waits.read_text().split("SigCgt:")[1].split()[0], 16) >> (signal.SIGTERM - 1) & 1))
+    started[1].send_signal(signal.SIGTERM)
+    assert started[1].communicate(timeout=TIMEOUT)[0] == ""
+    assert started[1].returncode == 143
+    assert started[0].communicate(timeout=TIMEOUT)[0]
+
+
 class TwoThatSay(Ranks):
     """Two ranks that have what they are given."""
 
@@ -256,11 +269,16 @@ def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
     assert plys(RunArchive.open(out)) == whole
 
 
-def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("where", "photo"), [("disk", "01.png"), ("memory", "02.png")])  # of rank 0, of rank 1
+def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun_and_replaces_no_run(
+    where: str, photo: str, tmp_path: Path
+) -> None:
     scene = write_scene(tmp_path / "scene", [f"{number:02d}.png" for number in range(16)])
-    damaged = sorted(scene.rglob("*.png"))[1]  # of rank 1
+    (damaged,) = scene.rglob(photo)
+    run = write_run(tmp_path / "run", scene)
+    before = snapshot(run)
     damaged.write_bytes(damaged.read_bytes()[:-40])
-    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
+    words = ["train", scene, "-o", run, *OPTIONS, "--images-on", where, "--overwrite"]
     ended = subprocess.run(
         [
             *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
@@ -277,6 +295,7 @@ def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Pat
     (line,) = (line for line in ended.stdout.splitlines() if line.startswith("lapgs:"))
     assert damaged.name in line
     assert "damaged or cut short" in line
+    assert snapshot(run) == before
 
 
 @pytest.mark.slow
