@@ -31,7 +31,7 @@ from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import NONE, resolve_masks, resolve_sky, share_inside
 from lapgs_plugin.scenes.normals import load_normals, resolve_normals
 from lapgs_plugin.scenes.options import SceneOptions
-from lapgs_plugin.scenes.scene import Scene, View, held_views
+from lapgs_plugin.scenes.scene import Scene, View, count_photos, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
 from lapgs_plugin.training.planning import make_plan, require_pruning
 from lapgs_plugin.training.prepared_run import PreparedRun, own_names, split_aside
@@ -371,6 +371,22 @@ def _require_points(request: TrainRequest, scene: Scene) -> None:
         raise UserInputError(
             f"{request.ranks.together} with --shard: the scene has {counted(count, 'point')} to start from; give at "
             "most so many ranks"
+        )
+
+
+def require_startable(ranks: Ranks, scene: Path, settings: TrainSettings, shard: bool) -> None:
+    """Refuse ranks that `prepare` would refuse in each of them, as far as that is known before they are started.
+
+    Raises:
+        UserInputError: there are more of them than photos or views of a step, or an option is for one process.
+    """
+    _require_one_process(ranks, settings)
+    if settings.asked_views is not None and not shard:
+        _require_view_of_each(ranks, settings.asked_views)
+    if (photos := count_photos(scene)) is not None and ranks.size > photos:
+        raise UserInputError(
+            f"{ranks.together}: the scene has {counted(photos, 'photo')}, and each rank needs one to train on; give "
+            "fewer ranks"
         )
 
 

@@ -31,12 +31,13 @@ from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
 from lapgs_plugin.training.trainer import Trainer
 from tests import ranks
+from tests.bent_scene import write_model
 from tests.cli.commands import succeeding
 from tests.cli.run_folder import write_run, write_scene
 from tests.folders import snapshot
 from tests.refusals import refuses
 from tests.training_runs import plys
-from tests.training_scene import blob_field
+from tests.training_scene import blob_field, ring_camera
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="needs PyTorch with gloo")
@@ -331,6 +332,9 @@ def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
     [
         (["--gpus", 2, "--rasterizer", "cpu"], "--gpus 2 with --rasterizer cpu: that trains on a CPU"),
         (["--gpus", 2, "--processes", 2], "--gpus 2 with --processes 2: give one of them"),
+        (["--processes", 17], "--processes 17: the scene has 16 photos, and each rank needs one to train on"),
+        (["--processes", 3, "--views-per-step", 2], "--processes 3: a step of this run has 2 views, fewer than ranks"),
+        (["--processes", 2, "--stop", "auto"], "--processes 2 with --stop auto: ends runs of one process alone"),
         pytest.param(
             ["--gpus", 2],
             "--gpus 2: this machine has no CUDA devices",
@@ -340,6 +344,12 @@ def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
 )
 def test_options_that_cannot_be_had_are_refused(words: Sequence[object], facts: str, scene: Path) -> None:
     refuses(UserInputError, facts, succeeding(app, 200), "train", scene, "-o", scene / "run", *words)
+
+
+def test_ranks_are_no_more_than_images_of_a_model(tmp_path: Path) -> None:
+    write_model(tmp_path, [ring_camera(angle, 56, 40) for angle in (0.0, 0.1, 0.2)], "PINHOLE", ())
+    facts = "--processes 4: the scene has 3 photos"
+    refuses(UserInputError, facts, succeeding(app, 200), "train", tmp_path, "-o", tmp_path / "run", "--processes", 4)
 
 
 @given(st.integers(1, 40), st.integers(1, 16), st.integers(0, 5))
