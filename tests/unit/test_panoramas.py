@@ -451,6 +451,18 @@ def test_faces_that_show_nothing_else_are_left_out(tmp_path: Path) -> None:
         np.testing.assert_array_equal(face.mask[0].numpy()[clear], (local[..., 0] > 0)[clear])
 
 
+def test_a_panorama_that_shows_nothing_else_is_refused(tmp_path: Path) -> None:
+    names = blank(tmp_path / "in/images")
+    source = transforms(tmp_path / "in", names, tilted())
+    low = np.repeat(np.arange(32) >= 28, 64).reshape(32, 64).astype(float)  # within 22.5 degrees of straight down
+    for name, mask in zip(names, (low, np.ones((32, 64))), strict=True):
+        save(tmp_path / "in/masks" / f"{name}.png", mask)
+    run(source, tmp_path / "out", tripod=10)
+    facts = "images/00.png: its mask and --tripod 60 hide all that it shows, expected a part to train on"
+    refuses(SceneError, facts, run, source, tmp_path / "out", tripod=60)
+    assert len(loaded(tmp_path / "out").train) > 10, "the scene that was there stays"
+
+
 @pytest.mark.parametrize("tripod", [0.0, 42.0, 43.0])
 def test_every_direction_is_on_a_face(tripod: float, tmp_path: Path) -> None:
     names, poses = blank(tmp_path / "in/images", size=(256, 128)), tilted()

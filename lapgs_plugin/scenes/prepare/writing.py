@@ -11,6 +11,7 @@ from pathlib import Path
 import pycolmap
 import torch
 
+from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.images import image_size, read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
 from lapgs_plugin.scenes.output import write_model
@@ -35,6 +36,9 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
 
     All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size. Panoramas
     become faces; one without a pixel inside of the mask is left out.
+
+    Raises:
+        SceneError: a photo has no other faces.
     """
     shutil.rmtree(job.scene, ignore_errors=True)
     model.tear_down()  # of cameras without photos
@@ -85,6 +89,12 @@ def _write_photo(job: Job, image: pycolmap.Image, lenses: Sequence[Lens], masked
             write_mask(job.scene / MASKS / f"{target}.png", used)
         write_image(job.scene / "images" / target, undistort(photo, lens))
         shown.append(lens)
+    if not shown:
+        tripod = f" and --tripod {job.settings.tripod:g} hide" if job.settings.tripod else " hides"
+        raise SceneError(
+            f"{job.photo(image.name)}: its mask{tripod} all that it shows, expected a part to train on; correct the "
+            "mask, or leave the photo out, and start over with --overwrite"
+        )
     return shown
 
 
