@@ -346,6 +346,17 @@ def test_cameras_without_a_pose_are_counted(tmp_path: Path, caplog: pytest.LogCa
     assert "of 7 photos 1 disabled, 1 not aligned, 1 in smaller components: left out" in caplog.text
 
 
+def test_lenses_of_photos_that_are_not_used_may_be_unknown(tmp_path: Path) -> None:
+    WRITERS["metashape"](tmp_path, synthetic())
+    other = (
+        '<sensor id="1" label="scan"><resolution width="9" height="9"/><calibration type="cylindrical" class="adjusted"'
+    )
+    other += '><resolution width="9" height="9"/></calibration></sensor></sensors>'
+    edit(tmp_path / "cameras.xml", "</sensors>", other)
+    edit(tmp_path / "cameras.xml", 'sensor_id="0" component_id="0" label="shot 4 a"', 'sensor_id="1" enabled="0"')
+    assert len(load_scene(tmp_path, progress=False).train) == 5
+
+
 PLACES = ("of the earth", "of the chunk", "elsewhere", "none")
 OF_THE_EARTH = [(points, cameras) for points in PLACES for cameras in ("oblique", "straight down", "panoramas")]
 OF_THE_EARTH += [(points, "wide survey") for points in PLACES[:2]]  # its world is not too far from the origin without

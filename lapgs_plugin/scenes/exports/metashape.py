@@ -93,12 +93,13 @@ class Metashape(SceneReader):
         """Read the aligned, enabled cameras of the chunk's largest component."""
         chunk = _only_chunk(source)
         cameras = chunk.findall("cameras//camera")
-        lenses = {sensor.get("id", ""): _lens(sensor, source) for sensor in chunk.findall("sensors/sensor")}
         enabled = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
+        posed = [camera for camera in enabled if camera.find("transform") is not None]
+        sensors = {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
+        needed = sensors.keys() & {camera.get("sensor_id", "") for camera in posed}
+        lenses = {key: _lens(sensors[key], source) for key in sorted(needed)}
         aligned = [
-            (camera, known)
-            for camera in enabled
-            if camera.find("transform") is not None and (known := lenses.get(camera.get("sensor_id", ""))) is not None
+            (camera, known) for camera in posed if (known := lenses.get(camera.get("sensor_id", ""))) is not None
         ]
         if not aligned:
             problem = f"none of its {len(cameras)} cameras is aligned and enabled" if cameras else "has no cameras"
