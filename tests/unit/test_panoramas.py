@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 import typer
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
@@ -403,6 +404,22 @@ def test_colmap_places_photos_of_a_fisheye_lens(walked: Path, tmp_path: Path) ->
     assert result.registered == ("0.jpg", "1.jpg", "2.jpg", "3.jpg")
     assert len(pycolmap.Reconstruction(tmp_path / "out/sparse/0").images) == 36
     assert all(view.masked for view in loaded(tmp_path / "out").train)
+
+
+def test_faces_are_not_said_to_be_turned_by_exif(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    wide_scene(tmp_path / "in", WIDE_LENSES[-1], tilted())
+    run(tmp_path / "in", tmp_path / "out")
+    faces = {view.name: view.image for view in loaded(tmp_path / "out").train}
+    for photo in (tmp_path / "in/images").iterdir():
+        with Image.open(photo) as opened:
+            exif = opened.getexif()
+            exif[ExifTags.Base.Orientation] = 6
+            opened.save(photo, exif=exif)
+    with caplog.at_level("INFO", "lapgs_plugin"):
+        run(tmp_path / "in", tmp_path / "again")
+    assert "turned" not in caplog.text
+    again = loaded(tmp_path / "again").train
+    assert all(torch.equal(view.image, faces[view.name]) for view in again)
 
 
 def test_lenses_that_see_less_are_one_image(tmp_path: Path) -> None:

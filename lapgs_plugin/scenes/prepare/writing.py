@@ -35,7 +35,7 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes.
 
     All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size. Panoramas
-    become faces; one without a pixel inside of the mask is left out.
+    and photos of wide lenses become faces, which are not turned; one without a pixel inside of the mask is left out.
 
     Raises:
         SceneError: a photo has no other faces.
@@ -44,11 +44,11 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     model.tear_down()  # of cameras without photos
     images = [image for image in model.images.values() if image.has_pose]
     ((turns, count),) = Counter(quarter_turns(job.photo(image.name)) or 0 for image in images).most_common(1)
-    if turns:
-        logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}
     asked = (job.settings.max_size, turns, job.settings.tripod)
     lenses = {key: lenses_of(camera, sizes[key], *asked) for key, camera in model.cameras.items()}
+    if turns and any(own[0].face is None for own in lenses.values()):
+        logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     cut = any(lens.face and lens.resized.model.name != ALL_AROUND for own in lenses.values() for lens in own)
     masked = job.masks.is_dir() or job.settings.tripod > 0 or cut
     targets = [(lens.name_of(image.name), image.name) for image in images for lens in lenses[image.camera_id]]
