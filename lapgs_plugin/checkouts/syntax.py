@@ -50,6 +50,22 @@ def executed_on_import(body: Iterable[ast.AST], *, surely: bool = False) -> Iter
                 yield from executed_on_import(getattr(node, part, []), surely=surely)
 
 
+def returns_value(function: ast.FunctionDef) -> bool:
+    """Return whether a function itself, not one that is defined in it, returns something else than None."""
+    nodes: list[ast.AST] = [*function.body]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.Return) and not (node.value is None or _is_none(node.value)):
+            return True
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)):
+            nodes += ast.iter_child_nodes(node)
+    return False
+
+
+def _is_none(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is None
+
+
 def plain_assignments(function: ast.FunctionDef) -> list[ast.stmt]:
     """Return the statements of a function's body that set local variables to values without calling anything.
 

@@ -14,12 +14,13 @@ def main() -> None:
     import gc
     import os
 
-    if "TORCHELASTIC_RUN_ID" in os.environ:  # C++ reports of ranks that are gone; torch reads it when it is imported
+    ranks = "TORCHELASTIC_RUN_ID" in os.environ
+    if ranks:  # C++ reports of ranks that are gone; torch reads it when it is imported
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
-    if "LAPGS_RANK_REPORTS" in os.environ:
+    if "LAPGS_RANK_REPORTS" in os.environ or (ranks and os.environ.get("RANK") != "0"):
         from lapgs_plugin.interrupt import be_silent
 
-        be_silent()  # the command that started this rank says how it ended
+        be_silent()  # the command that started this rank, or under torchrun rank 0, says how it ended
 
     # Importing torch makes a million objects and no garbage. Collections would take a tenth of the time until a command
     # begins.

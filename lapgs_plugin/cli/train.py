@@ -114,23 +114,29 @@ class StartOptions:
         launcher.require_gpus(self.gpus, rasterizer)
         return Workers.on_gpus(self.gpus)
 
-    def launches(self, rasterizer: str) -> bool:
+    def launches(self, scene: Path, settings: TrainSettings, rasterizer: str) -> bool:
         """Run this command on several ranks if that is asked for; return whether it has.
 
         Args:
-            rasterizer: that is asked for.
+            scene: the scene folder.
+            settings, rasterizer: that are asked for.
 
         Raises:
-            UserInputError: the machine has not as many GPUs, or torchrun started another number of ranks.
+            UserInputError: the machine has not as many GPUs, the scene or the settings are for fewer ranks, or torchrun
+                started another number of them.
         """
-        asked = self.gpus or self.processes
+        from lapgs_plugin.training.preparation import require_startable
+        from lapgs_plugin.training.ranks.group import AskedRanks
+
+        asked, option = self.gpus or self.processes, "--processes" if self.gpus is None else "--gpus"
         if self.gpus is not None:
             launcher.require_gpus(self.gpus, rasterizer)
         if launcher.is_rank():
-            launcher.join_started("--processes" if self.gpus is None else "--gpus", asked)
+            launcher.join_started(option, asked)
             return False
         if asked is None or asked == 1:
             return False
+        require_startable(AskedRanks(option, asked), scene, settings, self.shard)
         launcher.launch(asked, self.gpus is not None, sys.argv[1:])
         return True
 
@@ -178,7 +184,7 @@ def train(
     in_tiles = start.tiling.asked is not None or (start.resume and has_grid(out))
     if in_tiles:
         start.require_for_tiles(out)
-    if not isinstance(context.obj, Rehearsal) and not in_tiles and start.launches(control.rasterizer):
+    if not isinstance(context.obj, Rehearsal) and not in_tiles and start.launches(scene, settings, control.rasterizer):
         return
     if leads := launcher.leads():
         log_to_stderr("%(message)s")

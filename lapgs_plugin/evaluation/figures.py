@@ -91,7 +91,7 @@ def evaluate_run(
     with one_pool():
         scene = run_scene(archive, options.scene)
         split, photos = ("test", scene.test) if scene.test else ("train", scene.train)
-        if options.scene is not None and is_other_scene(archive, scene):
+        if is_other_scene(archive, options.scene):
             split, photos = "other", tuple(sorted((*scene.train, *scene.test), key=lambda view: view.name))
         smallest = min(min(view.camera.size) for view in photos)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)

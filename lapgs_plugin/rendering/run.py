@@ -95,20 +95,31 @@ def _errors_about_scene(archive: RunArchive, moved_to: Path | None) -> AbstractC
     return errors_about(archive.path(MANIFEST) if moved_to is None else "--scene")
 
 
-def is_other_scene(archive: RunArchive, scene: Scene) -> bool:
-    """Return whether a scene has none of the photos that a run was trained on; False if those are missing now."""
+def is_other_scene(archive: RunArchive, moved_to: Path | None, cameras: Mapping[str, Camera] | None = None) -> bool:
+    """Return whether a folder has none of the photos that a run was trained on, by their names and poses.
+
+    False if those are missing now: the scene was moved.
+
+    Args:
+        archive: of the run.
+        moved_to: current folder of the scene; None if it is where the manifest says.
+        cameras: of that folder by view name, as its files have them; None reads them.
+    """
+    reference = archive.manifest.scene
+    trained_on = Path(reference.path)
+    # Of the folder that the run was trained on, such as `lapgs train` gives at its end, files need not be read again.
+    if moved_to is None or moved_to.absolute() == trained_on or not is_folder(trained_on):
+        return False
     try:
-        trained, held_out = run_cameras(archive)
-    except (RunFolderError, SceneError):
-        return False  # it was moved, and `scene` is where it is now
-    return _have_nothing_in_common({**trained, **held_out}, _by_name((*scene.train, *scene.test)))
-
-
-def _have_nothing_in_common(own: Mapping[str, Camera], others: Mapping[str, Camera]) -> bool:
-    """Return whether no view is in both by its name and its pose."""
+        own = _scene_cameras(reference, trained_on)
+        here = _scene_cameras(reference, moved_to) if cameras is None else (cameras,)
+    except SceneError:
+        return False
+    trained = {name: camera for part in own for name, camera in part.items()}
     return not any(
-        name in own and torch.allclose(own[name].world_to_camera, camera.world_to_camera)
-        for name, camera in others.items()
+        name in trained and torch.allclose(trained[name].world_to_camera, camera.world_to_camera)
+        for part in here
+        for name, camera in part.items()
     )
 
 
@@ -146,24 +157,10 @@ def _as_rendered(
     Raises:
         RunFolderError: as `_as_trained` and `refined`.
     """
-    reference = archive.manifest.scene
-    # Of the folder that the run was trained on, such as `lapgs train` gives at its end, files need not be read again.
-    moved = moved_to is not None and moved_to.absolute() != Path(reference.path)
-    if moved and _is_of_others(reference, {**train, **test}):
+    if is_other_scene(archive, moved_to, {**train, **test}):
         return dict(train), dict(test)
     train, test = _as_trained(archive, train, test)
     return refined(archive, train), refined(archive, test)
-
-
-def _is_of_others(reference: SceneReference, cameras: Mapping[str, Camera]) -> bool:
-    """Return whether cameras, as files have them, are none of the scene of a run; False if that is missing now."""
-    if not is_folder(Path(reference.path)):
-        return False
-    try:
-        trained, held_out = _scene_cameras(reference, Path(reference.path))
-    except SceneError:
-        return False
-    return _have_nothing_in_common({**trained, **held_out}, cameras)
 
 
 def _by_name(views: Sequence[View]) -> dict[str, Camera]:

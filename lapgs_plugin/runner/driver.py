@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import logging
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from lapgs_plugin.checkouts.attachment import Attachment
+from lapgs_plugin.checkouts.syntax import returns_value
 from lapgs_plugin.checkouts.training_call import TrainingCall
 from lapgs_plugin.runner.active_stage import ActiveStage
 from lapgs_plugin.runner.context import CheckoutContext, FinishedStage, RunRequest, StageResult, TrainingRun
@@ -30,6 +32,10 @@ from lapgs_plugin.runner.single_call import SingleCall
 from lapgs_plugin.runner.step_clock import counting_steps
 
 logger = logging.getLogger(__name__)
+
+
+class _NoResult(SystemExit):
+    """End the main block, because it may use what `training` returns, which was not called."""
 
 
 class HierarchyDriver:
@@ -55,12 +61,17 @@ class HierarchyDriver:
             # Handing a backward pass to a thread of autograd's and waiting for it takes up to a tenth of an iteration.
             torch.autograd.set_multithreading_enabled(False),
             self._context.parts.watching_optimizers(),
+            suppress(_NoResult),
         ):
             self._context.adapter.script.run_main()
         return self._folder
 
     def _train(self, call: TrainingCall) -> Any:
-        """Train the hierarchy in place of the script's call of `training`, and return the result of its last call."""
+        """Train the hierarchy in place of the script's call of `training`, and return the result of its last call.
+
+        Raises:
+            _NoResult: the run was finished before, and `training` returns something.
+        """
         profile = self._context.adapter.profile
         if len(profile.source.models) > 1:
             with undisturbed(self._context.device):
@@ -71,9 +82,17 @@ class HierarchyDriver:
             self._context.scalars.written(),
         ):
             with prepare(self._context, call) as run:
+                finished = run.archive.manifest.complete
                 returned = _train_run(run)
             self._folder = run.archive.path()
             logger.info("run folder: %s; next: `lapgs eval %s`", run.folder, shlex.quote(str(run.folder)))
+        if finished and returns_value(profile.source.training):
+            logger.info(
+                "%s() was not called, so that %s ends here: what follows may use its result",
+                call.function.__name__,
+                self._context.adapter.script.path.name,
+            )
+            raise _NoResult(0)
         return returned
 
 

@@ -173,7 +173,10 @@ def colmap_distortion(subject: str, kind: str, distortion: Mapping[str, object],
 def count_frames(path: Path) -> int | None:
     """Return how many frames transforms.json lists; None if it is not there or cannot be read."""
     with suppress(SceneError):
-        return len(_read_json(path / SINGLE_FILE)["frames"]) if is_file(path / SINGLE_FILE) else None
+        if is_file(path / SINGLE_FILE):
+            values = _read_json(path / SINGLE_FILE)
+            parts = values["frames"], values.get(TEST_FRAMES)
+            return sum(len(part) for part in parts if isinstance(part, list))
     return None
 
 

@@ -23,8 +23,9 @@ from lapgs_plugin.fields.units import unit_of_depth
 from lapgs_plugin.files import is_file, is_folder
 from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, places_of
 from lapgs_plugin.limits import VIEW_PIXELS
-from lapgs_plugin.scenes.blender import SINGLE_FILE, count_frames, has_transforms, read_transforms
+from lapgs_plugin.scenes.blender import SINGLE_FILE, TRAIN_FILE, count_frames, has_transforms, read_transforms
 from lapgs_plugin.scenes.colmap import MODEL_PLACES, find_model, read_colmap
+from lapgs_plugin.scenes.colmap_model import count_images
 from lapgs_plugin.scenes.exports.registry import find_export, read_export
 from lapgs_plugin.scenes.images import PhotoFile, image_size, not_there, read_as_3dgs, same_shape, where_else
 from lapgs_plugin.scenes.masks import (
@@ -342,15 +343,21 @@ def _within_lens(mask: Tensor | None, camera: Camera, path: Path) -> Tensor | No
     return rest
 
 
-def held_views(views: Sequence[View], *, progress: bool | ProgressCallback = True) -> list[View]:
-    """Return views whose images are in memory; `progress` as `load_scene` takes it.
+def held_views(views: Sequence[View], *, hold: bool = True, progress: bool | ProgressCallback = True) -> list[View]:
+    """Read the images of views and return the views with them in memory.
+
+    Args:
+        views: to read.
+        hold: without it, images are only read once, to find out whether they can be, and views returned as they are.
+        progress: as `load_scene` takes it.
 
     Raises:
         SceneError: an image or a mask cannot be read.
     """
 
     def held(view: View) -> View:
-        return View(view.name, view.camera, view.image, view.mask, view.sky)
+        read = View(view.name, view.camera, view.image, view.mask, view.sky)
+        return read if hold else view
 
     readers = readers_of(view.camera.size for view in views)
     return in_threads("Reading images", "images", held, views, most=readers, progress=progress)
@@ -430,6 +437,13 @@ def _checked_source(path: Path, images: str, evaluate: bool, distorted: bool) ->
             f"{path}: no camera of it is distorted, so that --distorted would only make training slower; leave it out"
         )
     return source
+
+
+def count_photos(path: Path) -> int | None:
+    """Return how many photos a scene folder lists, without reading more of it; None where that takes longer."""
+    if (model := find_model(path)) is not None:
+        return count_images(model) or None
+    return None if is_file(path / TRAIN_FILE) else count_frames(path)
 
 
 def require_colmap_or_transforms(path: Path) -> None:

@@ -101,6 +101,7 @@ class StageState(_State):
     counts: CountsState
     loss: float
     most_views: PositiveInt | None
+    least_sh_degree: NotRequired[NonNegativeInt]
     breakdown: dict[str, Seconds]
     budget: BudgetState | None
     gains: GainsState | None

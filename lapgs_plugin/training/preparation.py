@@ -31,13 +31,14 @@ from lapgs_plugin.scenes.depth import load_depth, resolve_depth
 from lapgs_plugin.scenes.masks import NONE, resolve_masks, resolve_sky, share_inside
 from lapgs_plugin.scenes.normals import load_normals, resolve_normals
 from lapgs_plugin.scenes.options import SceneOptions
-from lapgs_plugin.scenes.scene import Scene, View, held_views
+from lapgs_plugin.scenes.scene import Scene, View, count_photos, held_views
 from lapgs_plugin.training.backend import long_on_a_cpu, training_rasterizer
 from lapgs_plugin.training.planning import make_plan, require_pruning
-from lapgs_plugin.training.prepared_run import PreparedRun
+from lapgs_plugin.training.prepared_run import PreparedRun, own_names, split_aside
 from lapgs_plugin.training.ranks.archive import open_for
 from lapgs_plugin.training.ranks.equality import require_same, source_checksum
 from lapgs_plugin.training.ranks.group import ALONE, Ranks
+from lapgs_plugin.training.ranks.steps import steps_of
 from lapgs_plugin.training.rate import views_per_second
 from lapgs_plugin.training.saved_settings import settings_from_manifest
 from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
@@ -177,6 +178,12 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
 
     scene = load_reference(reference, decide, **_reading(request, settings))
     _require_points(request, scene)
+    if ranks.size > 1:  # before a run is replaced, too
+        trained, aside = split_aside(scene, settings)
+        steps = steps_of(
+            len(trained.train), settings.seed, 0, settings.ranks, ranks, placed.device, sharded=request.shard
+        )
+        scene = _with_photos(scene, own_names(trained, aside, steps, ranks), settings, ranks)
     if settings.time is not None:
         settings = _fitted_into_time(request, scene, placed, say)
     depth = load_depth(scene, settings.depth, reference.images, say)
@@ -197,7 +204,7 @@ def _new_run(request: TrainRequest, reference: SceneReference, say: Say) -> Iter
             ranks=ranks,
             shard=request.shard,
         )
-        run = _ready(run)
+        _require_views_of_steps(run)
         _say_about_photos(run, say)
         yield run
 
@@ -266,7 +273,10 @@ def _continued_run(request: TrainRequest, reference: SceneReference, say: Say) -
                 shard=request.shard,
             )
         _require_same_run(ranks, scene, settings)
-        run = _ready(run)
+        _require_views_of_steps(run)
+        if ranks.size > 1:
+            trained, aside = split_aside(_with_photos(scene, run.own, settings, ranks), settings)
+            run = replace(run, scene=trained, aside=aside)
         if began is not None:
             archive.change_settings({"time": settings.time})
         if "ranks" in changed:
@@ -314,22 +324,22 @@ def _reading(request: TrainRequest, settings: TrainSettings) -> dict[str, bool]:
     return {"hold": alone and settings.images_on != "disk", "read": alone}
 
 
-def _ready(run: PreparedRun) -> PreparedRun:
-    """Read the photos that this rank trains on, if it has not; check that every rank has a view of each step."""
-    ranks = run.ranks
-    if ranks.size == 1:
-        return run
-    _require_view_of_each(ranks, min(run.schedule_of(stage).views for stage in run.plan))
-    if run.settings.images_on == "disk":
-        return run
-    held = held_views(run.owned((*run.scene.train, *run.aside, *run.scene.test)), progress=ranks.leads)
+def _with_photos(scene: Scene, own: frozenset[str], settings: TrainSettings, ranks: Ranks) -> Scene:
+    """Return the scene with the photos of this rank's `own` views in memory; those on the disk are only checked."""
+    views = [view for view in (*scene.train, *scene.test) if view.name in own]
+    held = held_views(views, hold=settings.images_on != "disk", progress=ranks.leads)
     by_name = {view.name: view for view in held}
 
-    def own(views: Iterable[View]) -> tuple[View, ...]:
+    def read(views: Iterable[View]) -> tuple[View, ...]:
         return tuple(by_name.get(view.name, view) for view in views)
 
-    scene = replace(run.scene, train=own(run.scene.train), test=own(run.scene.test))
-    return replace(run, scene=scene, aside=own(run.aside))
+    return replace(scene, train=read(scene.train), test=read(scene.test))
+
+
+def _require_views_of_steps(run: PreparedRun) -> None:
+    """Check that every rank has a view of each step."""
+    if run.ranks.size > 1:
+        _require_view_of_each(run.ranks, min(run.schedule_of(stage).views for stage in run.plan))
 
 
 def _require_shardable(request: TrainRequest, settings: TrainSettings, scene: SceneReference) -> None:
@@ -363,6 +373,22 @@ def _require_points(request: TrainRequest, scene: Scene) -> None:
         raise UserInputError(
             f"{request.ranks.together} with --shard: the scene has {counted(count, 'point')} to start from; give at "
             "most so many ranks"
+        )
+
+
+def require_startable(ranks: Ranks, scene: Path, settings: TrainSettings, shard: bool) -> None:
+    """Refuse ranks that `prepare` would refuse in each of them, as far as that is known before they are started.
+
+    Raises:
+        UserInputError: there are more of them than photos or views of a step, or an option is for one process.
+    """
+    _require_one_process(ranks, settings)
+    if settings.asked_views is not None and not shard:
+        _require_view_of_each(ranks, settings.asked_views)
+    if (photos := count_photos(scene)) is not None and ranks.size > photos:
+        raise UserInputError(
+            f"{ranks.together}: the scene has {counted(photos, 'photo')}, and each rank needs one to train on; give "
+            "fewer ranks"
         )
 
 

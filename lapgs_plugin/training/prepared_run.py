@@ -38,6 +38,27 @@ from lapgs_plugin.training.settings import BEST, TrainingControl, TrainSettings
 from lapgs_plugin.training.strategies import Strategy
 
 
+def split_aside(scene: Scene, settings: TrainSettings) -> tuple[Scene, tuple[View, ...]]:
+    """Return the scene without the training views that are set aside for --keep best, and these."""
+    aside = set_aside(scene.train) if settings.keep == BEST else []
+    names = {view.name for view in aside}
+    return replace(scene, train=tuple(view for view in scene.train if view.name not in names)), tuple(aside)
+
+
+def own_names(scene: Scene, aside: Sequence[View], steps: WholeSteps, ranks: Ranks) -> frozenset[str]:
+    """Return the names of the views whose images a rank has.
+
+    Args:
+        scene: without the views set aside.
+        aside: these.
+        steps: of any stage.
+        ranks: the group.
+    """
+    trained = [scene.train[index] for part in steps.own(range(len(scene.train))) for index in part]
+    measured = (*scene.test, *aside)[ranks.rank :: ranks.size]
+    return frozenset(view.name for view in (*trained, *measured))
+
+
 @dataclass(frozen=True)
 class PreparedRun(StagedRun):
     """Hold a run that is ready to train. `preparation.prepare` makes it from a request, `of` from a scene in memory.
@@ -106,13 +127,12 @@ class PreparedRun(StagedRun):
         Raises:
             UserInputError: as `make_plan`.
         """
-        views = scene.train
-        aside = set_aside(views) if settings.keep == BEST else []
-        names, sharding = {view.name for view in aside}, sharding_of(ranks, shard)
-        plan = make_plan(scene.smallest_size, settings, len(views))
+        sharding = sharding_of(ranks, shard)
+        plan = make_plan(scene.smallest_size, settings, len(scene.train))
+        trained, aside = split_aside(scene, settings)
         run = cls(
-            scene=replace(scene, train=tuple(view for view in views if view.name not in names)),
-            aside=tuple(aside),
+            scene=trained,
+            aside=aside,
             settings=settings,
             plan=plan,
             planned=plan,
@@ -175,13 +195,7 @@ class PreparedRun(StagedRun):
     @cached_property
     def own(self) -> frozenset[str]:
         """Names of the views whose images this rank has."""
-        trained = [
-            self.scene.train[index]
-            for part in self.steps_of(self.plan[0], len(self.scene.train)).own(range(len(self.scene.train)))
-            for index in part
-        ]
-        measured = (*self.scene.test, *self.aside)[self.ranks.rank :: self.ranks.size]
-        return frozenset(view.name for view in (*trained, *measured))
+        return own_names(self.scene, self.aside, self.steps_of(self.plan[0], len(self.scene.train)), self.ranks)
 
     def owned(self, views: Sequence[View]) -> tuple[View, ...]:
         """Return those views whose images this rank has."""

@@ -69,6 +69,7 @@ class StageSchedule:
         accumulate_from, accumulate_views: from this iteration on, the gradients of so many views make one step.
         views: the same for earlier steps. A step ends early where something is due.
         extended: iterations after the `iterations` of the schedule, all as the last one is.
+        least_sh_degree: reached before the stage got another length, which changes `sh_every`.
     """
 
     iterations: int
@@ -87,6 +88,7 @@ class StageSchedule:
     before: int
     views: int = 1
     extended: int = 0
+    least_sh_degree: int = 0
 
     @classmethod
     def create(
@@ -216,4 +218,4 @@ class StageSchedule:
         return factor
 
     def active_sh_degree(self, iteration: int) -> int:
-        return min(self.sh_degree, (self.before + iteration) // self.sh_every)
+        return min(self.sh_degree, max(self.least_sh_degree, (self.before + iteration) // self.sh_every))

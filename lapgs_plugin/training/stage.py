@@ -235,7 +235,9 @@ class StageRun:
         self.prepared = self.prepared.lasting(self.stage.level, iterations)
         self.stage = self.record.stage = self.prepared.plan[self.stage.level]
         self.record.iterations = self.prepared.plan.iterations
-        planned_before, self.schedule = self.schedule, self.prepared.schedule_of(self.stage)
+        planned_before, schedule = self.schedule, self.prepared.schedule_of(self.stage)
+        # Renders never leave out coefficients that were trained.
+        self.schedule = replace(schedule, least_sh_degree=planned_before.active_sh_degree(self.counts.iteration))
         statistics = self.densifier.state
         self.densifier = self.prepared.density_control(self.stage, self.schedule)
         self.densifier.state = statistics
@@ -602,6 +604,7 @@ class StageRun:
             "counts": vars(self.counts),
             "loss": self.loss,
             "most_views": self._planner.most_views,
+            "least_sh_degree": self.schedule.least_sh_degree,
             "breakdown": self._breakdown.seconds(),
             "budget": None if self.budget is None else self.budget.state(),
             "gains": None if self.gains is None else self.gains.state(),

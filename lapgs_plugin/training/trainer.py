@@ -221,6 +221,8 @@ class Trainer:
         prepared, aside = self.prepared, self.prepared.aside
         before = prepared.record_to_extend(stage)
         schedule = self._schedule(stage)
+        if checkpoint is not None:
+            schedule = replace(schedule, least_sh_degree=checkpoint.get("least_sh_degree", 0))
         record = self._record(replace(stage, iterations=schedule.end), before, checkpoint)
         record.start()
         model = self._model(stage, checkpoint, record.overhead)

@@ -236,6 +236,15 @@ def test_eval_says_that_views_are_of_another_scene(hold_out: bool, scene: Path, 
     assert json.loads((run / "metrics.json").read_text())["split"] == ("test" if hold_out else "train")
 
 
+def test_another_scene_is_told_where_photos_of_the_run_have_another_size_now(scene: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(scene, own)
+    run = write_run(tmp_path / "run", own)
+    write_scene(own, size=(20, 16))
+    lapgs("eval", run, "--scene", write_scene(tmp_path / "others", [f"others/{i:02d}.png" for i in range(9)]))
+    assert json.loads((run / "metrics.json").read_text())["split"] == "other"
+
+
 def test_what_a_run_learned_of_its_photos_is_not_used_for_photos_of_the_same_name(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene)
     others = write_scene(tmp_path / "others", [f"photos/{i:02d}.png" for i in range(1, 10)])  # at other poses

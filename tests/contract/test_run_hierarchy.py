@@ -22,6 +22,7 @@ from lapgs_plugin.scenes import load_scene
 from tests.contract.stub_runs import (
     HALF,
     ITERATIONS,
+    KINDS,
     NAMES,
     SHORT,
     STUBS,
@@ -29,7 +30,9 @@ from tests.contract.stub_runs import (
     StopAt,
     captured,
     composed_psnr,
+    drive,
     drive_residuals,
+    edited_graphdeco,
     loaded,
     run_residuals,
 )
@@ -262,6 +265,34 @@ class StopInside(StageHook):
     def before_render(self, context: StageContext) -> None:
         if (context.stage.level, context.iteration) == self._place:
             raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("hierarchy", KINDS)
+def test_a_script_that_uses_what_training_returns_ends_there_when_its_run_is_finished(
+    hierarchy: str, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = edited_graphdeco(tmp_path / "own", "train.py", "\n    training(\n", "\n    trained = training(\n")
+    text = script.read_text(encoding="utf-8")
+    for old, new in (
+        ("\n\n\ndef prepare_output", "\n    return gaussians\n\n\ndef prepare_output"),
+        ('print("\\nTraining complete.")', 'print(len(trained.get_xyz), "trained")'),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    script.write_text(text, encoding="utf-8")
+    results: list[Result] = []
+    for resume in (False, True):
+        caplog.clear()
+        folder = tmp_path / "run"
+        with (
+            caplog.at_level("INFO", "lapgs_plugin"),
+            captured(folder, results),
+            loaded(STUBS["graphdeco"], scene, folder, *SHORT, script=script) as adapter,
+        ):
+            drive(adapter, hierarchy=hierarchy, resume=resume)
+        line = "training() was not called, so that train.py ends here: what follows may use its result"
+        assert (line in caplog.messages) == resume
+        assert (" trained" in results[-1].output) != resume
 
 
 def noted(archive: RunArchive) -> list[tuple[int, int, set[str]]]:

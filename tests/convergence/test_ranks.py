@@ -31,11 +31,13 @@ from lapgs_plugin.training.settings import Densification, TrainSettings
 from lapgs_plugin.training.strategies import Gradients
 from lapgs_plugin.training.trainer import Trainer
 from tests import ranks
+from tests.bent_scene import write_model
 from tests.cli.commands import succeeding
-from tests.cli.run_folder import write_scene
+from tests.cli.run_folder import write_run, write_scene
+from tests.folders import snapshot
 from tests.refusals import refuses
 from tests.training_runs import plys
-from tests.training_scene import blob_field
+from tests.training_scene import blob_field, ring_camera
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="needs PyTorch with gloo")
@@ -163,6 +165,18 @@ def test_why_one_rank_cannot_go_on_is_said_by_rank_0_alone(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_rank_that_is_stopped_says_nothing(scene: Path, tmp_path: Path) -> None:
+    """torchrun's agent stops the other ranks when one has failed."""
+    started = ranks.start("lapgs_plugin", [["help"], ["train", scene, "-o", tmp_path / "run"]])
+    waits = Path(f"/proc/{started[1].pid}/status")
+    wait_for(lambda: bool(int(waits.read_text().split("SigCgt:")[1].split()[0], 16) >> (signal.SIGTERM - 1) & 1))
+    started[1].send_signal(signal.SIGTERM)
+    assert started[1].communicate(timeout=TIMEOUT)[0] == ""
+    assert started[1].returncode == 143
+    assert started[0].communicate(timeout=TIMEOUT)[0]
+
+
 class TwoThatSay(Ranks):
     """Two ranks that have what they are given."""
 
@@ -256,11 +270,16 @@ def test_a_rank_that_is_killed_ends_a_continued_run_which_continues_on_fewer(
     assert plys(RunArchive.open(out)) == whole
 
 
-def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("where", "photo"), [("disk", "01.png"), ("memory", "02.png")])  # of rank 0, of rank 1
+def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun_and_replaces_no_run(
+    where: str, photo: str, tmp_path: Path
+) -> None:
     scene = write_scene(tmp_path / "scene", [f"{number:02d}.png" for number in range(16)])
-    damaged = sorted(scene.rglob("*.png"))[1]  # of rank 1
+    (damaged,) = scene.rglob(photo)
+    run = write_run(tmp_path / "run", scene)
+    before = snapshot(run)
     damaged.write_bytes(damaged.read_bytes()[:-40])
-    words = ["train", scene, "-o", tmp_path / "run", *OPTIONS]
+    words = ["train", scene, "-o", run, *OPTIONS, "--images-on", where, "--overwrite"]
     ended = subprocess.run(
         [
             *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
@@ -277,6 +296,7 @@ def test_a_photo_that_one_rank_cannot_read_is_named_under_torchrun(tmp_path: Pat
     (line,) = (line for line in ended.stdout.splitlines() if line.startswith("lapgs:"))
     assert damaged.name in line
     assert "damaged or cut short" in line
+    assert snapshot(run) == before
 
 
 @pytest.mark.slow
@@ -312,6 +332,9 @@ def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
     [
         (["--gpus", 2, "--rasterizer", "cpu"], "--gpus 2 with --rasterizer cpu: that trains on a CPU"),
         (["--gpus", 2, "--processes", 2], "--gpus 2 with --processes 2: give one of them"),
+        (["--processes", 17], "--processes 17: the scene has 16 photos, and each rank needs one to train on"),
+        (["--processes", 3, "--views-per-step", 2], "--processes 3: a step of this run has 2 views, fewer than ranks"),
+        (["--processes", 2, "--stop", "auto"], "--processes 2 with --stop auto: ends runs of one process alone"),
         pytest.param(
             ["--gpus", 2],
             "--gpus 2: this machine has no CUDA devices",
@@ -321,6 +344,12 @@ def test_more_ranks_than_photos_are_refused_in_one_line(tmp_path: Path) -> None:
 )
 def test_options_that_cannot_be_had_are_refused(words: Sequence[object], facts: str, scene: Path) -> None:
     refuses(UserInputError, facts, succeeding(app, 200), "train", scene, "-o", scene / "run", *words)
+
+
+def test_ranks_are_no_more_than_images_of_a_model(tmp_path: Path) -> None:
+    write_model(tmp_path, [ring_camera(angle, 56, 40) for angle in (0.0, 0.1, 0.2)], "PINHOLE", ())
+    facts = "--processes 4: the scene has 3 photos"
+    refuses(UserInputError, facts, succeeding(app, 200), "train", tmp_path, "-o", tmp_path / "run", "--processes", 4)
 
 
 @given(st.integers(1, 40), st.integers(1, 16), st.integers(0, 5))

@@ -10,7 +10,10 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import TrainingDivergedError, TrainingStoppedError
+from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.rasterizer import RenderResult
 from lapgs_plugin.hooks import StageContext, StageHook
+from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.scenes.scene import Scene
 from lapgs_plugin.training.settings import TrainSettings
@@ -104,3 +107,30 @@ def test_divergence_is_named_where_the_clock_ends_a_level_at_once(scene: Scene, 
     settings = TrainSettings(iterations=400, levels=1, time="6s", sh_degree=0, appearance="none")
     with pytest.raises(TrainingDivergedError, match=r"level 0, iteration 40: .*NaN"):
         train(tmp_path / "run", scene, settings, clock=ticks, user_hooks=[ticks])
+
+
+class Degrees(CpuRasterizer):
+    """Note the SH degrees of renders."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[int] = []
+
+    def __call__(self, field: GaussianField, *values: Any, sh_degree: int | None = None, **more: Any) -> RenderResult:
+        if sh_degree is not None:
+            self.seen.append(sh_degree)
+        return super().__call__(field, *values, sh_degree=sh_degree, **more)
+
+
+def test_no_level_falls_back_to_a_lower_sh_degree_when_it_gets_longer(scene: Scene, tmp_path: Path) -> None:
+    """60 iterations are expected: degree 2 from the fourth on. The clock allows 1000, of which it would be the 66th."""
+    settings = TrainSettings(iterations=60, levels=1, time="10s", sh_degree=2, appearance="none")
+    whole = Degrees()
+    ended = train(tmp_path / "whole", scene, settings, whole, **timed())
+    assert ended.manifest.record(0).iterations > 500
+    degrees = whole.seen[1:]  # the first render looks whether anything is visible
+    assert degrees[:10] == sorted(degrees[:10])
+    assert set(degrees[4:]) == {2}
+    with pytest.raises(TrainingStoppedError):
+        train(tmp_path / "parts", scene, settings, monitor=StopAt(0, 40), **timed())
+    assert plys(resume(tmp_path / "parts", scene, settings, **timed())) == plys(ended)

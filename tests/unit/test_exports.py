@@ -346,16 +346,38 @@ def test_cameras_without_a_pose_are_counted(tmp_path: Path, caplog: pytest.LogCa
     assert "of 7 photos 1 disabled, 1 not aligned, 1 in smaller components: left out" in caplog.text
 
 
-@pytest.mark.parametrize("points", ["of the earth", "of the chunk", "elsewhere", "none"])
-def test_coordinates_of_the_earth_are_used_only_with_points_in_them(
-    points: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lenses_of_photos_that_are_not_used_may_be_unknown(tmp_path: Path) -> None:
+    WRITERS["metashape"](tmp_path, synthetic())
+    other = (
+        '<sensor id="1" label="scan"><resolution width="9" height="9"/><calibration type="cylindrical" class="adjusted"'
+    )
+    other += '><resolution width="9" height="9"/></calibration></sensor></sensors>'
+    edit(tmp_path / "cameras.xml", "</sensors>", other)
+    edit(tmp_path / "cameras.xml", 'sensor_id="0" component_id="0" label="shot 4 a"', 'sensor_id="1" enabled="0"')
+    assert len(load_scene(tmp_path, progress=False).train) == 5
+
+
+PLACES = ("of the earth", "of the chunk", "elsewhere", "none")
+OF_THE_EARTH = [(points, cameras) for points in PLACES for cameras in ("oblique", "straight down", "panoramas")]
+OF_THE_EARTH += [(points, "wide survey") for points in PLACES[:2]]  # its world is not too far from the origin without
+
+
+@pytest.mark.parametrize(("points", "cameras"), OF_THE_EARTH)
+def test_coordinates_of_the_earth_are_used_only_with_points_in_them(points: str, cameras: str, tmp_path: Path) -> None:
     capture, place = synthetic(), np.array([4.2e6, 1.7e5, 4.8e6])
+    if cameras == "panoramas":
+        capture = replace(capture, size=(256, 128))
+    elif cameras != "oblique":
+        place = np.array([0.0, 0.0, -6.4e6])  # cameras look at the centre of the earth, where points of the chunk are
+    if cameras == "wide survey":
+        capture = replace(capture, shifts=700.0 * capture.shifts, xyz=700.0 * capture.xyz)
     turn, scale, shift = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), 2.5, np.array([3.0, -4.0, 5.0])
     WRITERS["metashape"](tmp_path, capture)  # with this transform
     edit(tmp_path / "cameras.xml", "<translation [^<]*<", f"<translation>{' '.join(map(str, shift + place))}<")
+    if cameras == "panoramas":
+        edit(tmp_path / "cameras.xml", 'type="frame">\\n', 'type="spherical">\\n')
     chunk = (capture.xyz - shift) @ turn / scale
-    choices = {"of the earth": capture.xyz + place, "of the chunk": chunk, "elsewhere": chunk - 1e3 * turn[2]}
+    choices = {"of the earth": capture.xyz + place, "of the chunk": chunk, "elsewhere": chunk - 1e6 * turn[2]}
     (tmp_path / "points.ply").unlink()
     if points in choices:
         write_ply(tmp_path / "points.ply", choices[points], capture.rgb)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 import typer
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
@@ -405,6 +406,22 @@ def test_colmap_places_photos_of_a_fisheye_lens(walked: Path, tmp_path: Path) ->
     assert all(view.masked for view in loaded(tmp_path / "out").train)
 
 
+def test_faces_are_not_said_to_be_turned_by_exif(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    wide_scene(tmp_path / "in", WIDE_LENSES[-1], tilted())
+    run(tmp_path / "in", tmp_path / "out")
+    faces = {view.name: view.image for view in loaded(tmp_path / "out").train}
+    for photo in (tmp_path / "in/images").iterdir():
+        with Image.open(photo) as opened:
+            exif = opened.getexif()
+            exif[ExifTags.Base.Orientation] = 6
+            opened.save(photo, exif=exif)
+    with caplog.at_level("INFO", "lapgs_plugin"):
+        run(tmp_path / "in", tmp_path / "again")
+    assert "turned" not in caplog.text
+    again = loaded(tmp_path / "again").train
+    assert all(torch.equal(view.image, faces[view.name]) for view in again)
+
+
 def test_lenses_that_see_less_are_one_image(tmp_path: Path) -> None:
     wide_scene(tmp_path / "in", ("OPENCV_FISHEYE", (160, 120), [90, 90, 80, 60, 0.01, 0, 0, 0]), tilted())
     run(tmp_path / "in", tmp_path / "out")
@@ -449,6 +466,18 @@ def test_faces_that_show_nothing_else_are_left_out(tmp_path: Path) -> None:
         clear = np.minimum(azimuth, math.pi - azimuth) > 0.2  # a mask's pixel is 0.1 wide
         clear &= np.hypot(local[..., 0], local[..., 2]) > 0.3  # away from the poles
         np.testing.assert_array_equal(face.mask[0].numpy()[clear], (local[..., 0] > 0)[clear])
+
+
+def test_a_panorama_that_shows_nothing_else_is_refused(tmp_path: Path) -> None:
+    names = blank(tmp_path / "in/images")
+    source = transforms(tmp_path / "in", names, tilted())
+    low = np.repeat(np.arange(32) >= 28, 64).reshape(32, 64).astype(float)  # within 22.5 degrees of straight down
+    for name, mask in zip(names, (low, np.ones((32, 64))), strict=True):
+        save(tmp_path / "in/masks" / f"{name}.png", mask)
+    run(source, tmp_path / "out", tripod=10)
+    facts = "images/00.png: its mask and --tripod 60 hide all that it shows, expected a part to train on"
+    refuses(SceneError, facts, run, source, tmp_path / "out", tripod=60)
+    assert len(loaded(tmp_path / "out").train) > 10, "the scene that was there stays"
 
 
 @pytest.mark.parametrize("tripod", [0.0, 42.0, 43.0])

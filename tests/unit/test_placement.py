@@ -25,18 +25,22 @@ PHOTOS, SIMPLE = 8, "SIMPLE_RADIAL"
 
 
 def model(*tracks: tuple[int, Sequence[int]], photos: int = PHOTOS, error: float = 0.0) -> pycolmap.Reconstruction:
-    """Make a model of photos 1, 2, ..., with numbers of points by the photos that see them, and their error."""
+    """Make a model of photos 1, 2, ..., with numbers of points by the photos that see them, and their error.
+
+    A photo may see a point twice.
+    """
     result = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 50.0, 64, 48)
     result.add_camera_with_trivial_rig(camera)
     count = sum(points for points, _ in tracks)
     for number in range(1, photos + 1):
-        image = pycolmap.Image(f"{number}.jpg", keypoints=np.ones((count, 2)), camera_id=1, image_id=number)
+        image = pycolmap.Image(f"{number}.jpg", keypoints=np.ones((2 * count, 2)), camera_id=1, image_id=number)
         result.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     index = 0
     for points, seen_by in tracks:
         for _ in range(points):
-            track = pycolmap.Track([pycolmap.TrackElement(number, index) for number in seen_by])
+            features = [index + count * seen_by[:place].count(number) for place, number in enumerate(seen_by)]
+            track = pycolmap.Track(list(map(pycolmap.TrackElement, seen_by, features)))
             result.points3D[result.add_point3D(np.ones(3), track, np.zeros(3, np.uint8))].error = error
             index += 1
     return result
@@ -51,6 +55,9 @@ def test_photos_that_points_do_not_link_are_removed() -> None:
     remove_unlinked(linked)
     assert placed(linked) == [1, 2, 3, 4]
     assert linked.num_points3D() == 30
+    repeated = model((15, (1, 2, 3)), (4, (3, 3, 4, 4)))  # by features that look alike
+    remove_unlinked(repeated)
+    assert placed(repeated) == [1, 2, 3]
     for photos in (0, 2):
         linked = model(photos=photos)
         remove_unlinked(linked)

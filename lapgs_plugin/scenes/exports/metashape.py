@@ -33,7 +33,7 @@ from lapgs_plugin.scenes.exports.base import (
     skipped,
     unknown_lens,
 )
-from lapgs_plugin.scenes.exports.points import SEEN, points_beside, seen_share
+from lapgs_plugin.scenes.exports.points import points_beside
 from lapgs_plugin.scenes.panorama import panorama_lens
 from lapgs_plugin.untrusted import read_xml, shortened
 
@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 LENSES = ("frame", "fisheye", "spherical")
 FAR = 1e4
 """Distance from the origin, in extents of the cameras, of coordinates of the earth."""
+CLOSER = 100.0
+"""Ratio of the distances from points to cameras, in the world and in the chunk, that says which of them the points are
+in. That cameras see them does not: photos taken straight down see the centre of the earth, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +93,13 @@ class Metashape(SceneReader):
         """Read the aligned, enabled cameras of the chunk's largest component."""
         chunk = _only_chunk(source)
         cameras = chunk.findall("cameras//camera")
-        lenses = {sensor.get("id", ""): _lens(sensor, source) for sensor in chunk.findall("sensors/sensor")}
         enabled = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
+        posed = [camera for camera in enabled if camera.find("transform") is not None]
+        sensors = {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
+        needed = sensors.keys() & {camera.get("sensor_id", "") for camera in posed}
+        lenses = {key: _lens(sensors[key], source) for key in sorted(needed)}
         aligned = [
-            (camera, known)
-            for camera in enabled
-            if camera.find("transform") is not None and (known := lenses.get(camera.get("sensor_id", ""))) is not None
+            (camera, known) for camera in posed if (known := lenses.get(camera.get("sensor_id", ""))) is not None
         ]
         if not aligned:
             problem = f"none of its {len(cameras)} cameras is aligned and enabled" if cameras else "has no cameras"
@@ -157,12 +161,17 @@ def _in_fitting_world(
     source: Path, world: _World, placed: list[_Placed], cloud: PointCloud | None
 ) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
     """Return shots in the world, or in the chunk's own coordinates if its world is the earth and the points are not."""
-    shots = tuple(map(world.shot, placed))
     centers = np.stack([world.center(one) for one in placed])
     extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    near = np.linalg.norm(centers.mean(axis=0)) <= FAR * extent
-    if near or (cloud is not None and seen_share(cloud.xyz, shots) >= SEEN):
-        return shots, ()
+    in_world, in_chunk = np.linalg.norm(centers.mean(axis=0)) <= FAR * extent, False
+    if cloud is not None and len(cloud.xyz):
+        middle = np.median(cloud.xyz, axis=0)
+        away = float(np.linalg.norm(centers.mean(axis=0) - middle)) / world.scale
+        away_in_chunk = float(np.linalg.norm(np.mean([one.pose[:3, 3] for one in placed], axis=0) - middle))
+        in_world |= away * CLOSER < away_in_chunk
+        in_chunk = away_in_chunk * CLOSER < away
+    if in_world and not in_chunk:
+        return tuple(map(world.shot, placed)), ()
     line = f"{source}: its world is the earth's; the chunk's own coordinates and units are used"
     return tuple(map(CHUNK.shot, placed)), (line,)
 

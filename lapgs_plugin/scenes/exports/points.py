@@ -21,6 +21,8 @@ TRIED_SHOTS = 50
 """About how many cameras they are compared with."""
 SEEN = 0.1
 """Share of points that cameras see at least if both are in the same coordinates."""
+AROUND = 100.0
+"""Farthest points that a panorama sees, in extents of the points and of the cameras together."""
 DEPTH_SHOTS = 40
 """Most depth maps that points are made of."""
 DEPTH_POINTS = 2_500
@@ -49,20 +51,34 @@ def points_beside(source: Path, *more: Path) -> PointCloud | None:
 def seen_share(points: Array, shots: Sequence[Shot]) -> float:
     """Return the share of points (n, 3) that at least one camera sees, were none hidden and no lens distorted.
 
-    A panorama sees all.
+    A panorama sees all that is not too far away to be of its scene.
     """
-    some = points[:: len(points) // TRIED_POINTS + 1]
+    some, tried = points[:: len(points) // TRIED_POINTS + 1], shots[:: len(shots) // TRIED_SHOTS + 1]
     seen = np.zeros(len(some), bool)
-    for shot in shots[:: len(shots) // TRIED_SHOTS + 1]:
+    farthest = AROUND * (_extent(some) + _extent(np.stack([_center(shot) for shot in tried])))
+    for shot in tried:
         if shot.camera.model.name == ALL_AROUND:  # pycolmap has no calibration matrix of it
-            seen[:] = True
-            break
+            seen |= np.linalg.norm(some - _center(shot), axis=1) <= farthest
+            continue
         local = some @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
         matrix, (width, height) = shot.camera.calibration_matrix(), (shot.camera.width, shot.camera.height)
         front = local[:, 2] > 0
         pixels = local[front, :2] / local[front, 2:] * matrix.diagonal()[:2] + matrix[:2, 2]
         seen[front] |= ((pixels >= 0) & (pixels <= (width, height))).all(axis=1)
     return float(seen.mean()) if len(seen) else 0.0
+
+
+def _center(shot: Shot) -> Array:
+    """Return the position of a camera in the world, (3,)."""
+    center: Array = -shot.world_to_camera[:3, :3].T @ shot.world_to_camera[:3, 3]
+    return center
+
+
+def _extent(positions: Array) -> float:
+    """Return the median distance of positions (n, 3) from their middle; 0 of none."""
+    if not len(positions):
+        return 0.0
+    return float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
 
 
 def depth_points(shots: Sequence[Shot], maps: Mapping[Path, Path], unit: float) -> PointCloud | None:

@@ -85,10 +85,14 @@ def lenses_of(
         resized = _resized(camera, photo, min(1.0, (max_size or math.inf) / longest))
         pinholes = [face.camera(focal_at_center(resized.width)) for face in faces]
         return tuple(Lens(recovered, resized, pin, 0, face, tripod) for face, pin in zip(faces, pinholes, strict=True))
-    resized = _resized(camera, photo, min(1.0, (max_size or math.inf) / max(photo)))
+    share = min(1.0, (max_size or math.inf) / max(photo))
+    resized = _resized(camera, photo, share)
     if wide := wide_faces(resized):
         return tuple(Lens(recovered, resized, face.camera(focal_towards(resized, face)), 0, face) for face in wide)
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), resized)
+    if max_size is not None and (longest := max(pinhole.width, pinhole.height)) > max_size:  # straightened barrels are
+        resized = _resized(camera, photo, share * max_size / longest)
+        pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(max_image_size=max_size), resized)
     return (Lens(recovered, resized, pinhole, turns),)
 
 

@@ -226,6 +226,7 @@ def _points_of(model: pycolmap.Reconstruction, images: Sequence[int]) -> tuple[c
     ]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T  # (n), (n)
     seen = coo_array((np.ones(len(rows), np.int64), (rows, columns)), (model.num_points3D(), len(images))).tocsr()
+    seen.data[:] = 1  # tracks may have several features of a photo
     return seen, (seen.T @ seen).tocsr()
 
 

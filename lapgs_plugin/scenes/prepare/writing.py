@@ -11,6 +11,7 @@ from pathlib import Path
 import pycolmap
 import torch
 
+from lapgs_plugin.errors import SceneError
 from lapgs_plugin.scenes.images import image_size, read_image, write_image
 from lapgs_plugin.scenes.masks import MASKS, write_mask
 from lapgs_plugin.scenes.output import write_model
@@ -34,17 +35,20 @@ def write_scene(job: Job, model: pycolmap.Reconstruction) -> None:
     """Write undistorted photos and the model to the work folder. Images are renamed if their file type changes.
 
     All are turned upright by the most frequent EXIF orientation, so that images of one camera keep one size. Panoramas
-    become faces; one without a pixel inside of the mask is left out.
+    and photos of wide lenses become faces, which are not turned; one without a pixel inside of the mask is left out.
+
+    Raises:
+        SceneError: a photo has no other faces.
     """
     shutil.rmtree(job.scene, ignore_errors=True)
     model.tear_down()  # of cameras without photos
     images = [image for image in model.images.values() if image.has_pose]
     ((turns, count),) = Counter(quarter_turns(job.photo(image.name)) or 0 for image in images).most_common(1)
-    if turns:
-        logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     sizes = {image.camera_id: image_size(job.photo(image.name)) for image in images}
     asked = (job.settings.max_size, turns, job.settings.tripod)
     lenses = {key: lenses_of(camera, sizes[key], *asked) for key, camera in model.cameras.items()}
+    if turns and any(own[0].face is None for own in lenses.values()):
+        logger.info("images are turned by %d degrees, as EXIF says of %d photos", 90 * turns, count)
     cut = any(lens.face and lens.resized.model.name != ALL_AROUND for own in lenses.values() for lens in own)
     masked = job.masks.is_dir() or job.settings.tripod > 0 or cut
     targets = [(lens.name_of(image.name), image.name) for image in images for lens in lenses[image.camera_id]]
@@ -85,6 +89,12 @@ def _write_photo(job: Job, image: pycolmap.Image, lenses: Sequence[Lens], masked
             write_mask(job.scene / MASKS / f"{target}.png", used)
         write_image(job.scene / "images" / target, undistort(photo, lens))
         shown.append(lens)
+    if not shown:
+        tripod = f" and --tripod {job.settings.tripod:g} hide" if job.settings.tripod else " hides"
+        raise SceneError(
+            f"{job.photo(image.name)}: its mask{tripod} all that it shows, expected a part to train on; correct the "
+            "mask, or leave the photo out, and start over with --overwrite"
+        )
     return shown
 
 

@@ -134,6 +134,22 @@ ALONE = Ranks()
 """The group of one."""
 
 
+class AskedRanks(Ranks):
+    """Describe ranks that are not started yet, to tell whether they can be.
+
+    Args:
+        option: that asks for them.
+        size: their number.
+    """
+
+    def __init__(self, option: str, size: int) -> None:
+        self.size, self._option = size, option
+
+    @property
+    def together(self) -> str:
+        return f"{self._option} {self.size}"
+
+
 class JoinedRanks(Ranks):
     """Train with other processes, which torchrun's agent started with this one.
 
