@@ -125,8 +125,8 @@ def _inside(field: GaussianField, level: int, crop: Crop | None) -> Tensor:
     if len(field) and not bool(inside.any()):
         low, high = np.quantile(field.means.numpy(), (0.1, 0.9), axis=0).tolist()
         raise UserInputError(
-            f"--crop {crop.text}: none of the {len(field):,} Gaussians of level {level} is inside; expected some of them, "
-            f"most are in the box {','.join(f'{value:.3g}' for value in (*low, *high))}; see `lapgs view --crop`"
+            f"--crop {crop.text}: none of the {len(field):,} Gaussians of level {level} is inside; expected some of "
+            f"them, most are in the box {','.join(f'{value:.3g}' for value in (*low, *high))}; see `lapgs view --crop`"
         )
     return inside
 
