@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from lapgs_plugin.errors import FieldError
 from lapgs_plugin.fields import sog
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.quantization import palette
 from lapgs_plugin.fields.sog import save_sog, save_streamed_sog
 from lapgs_plugin.reference_raster import CpuRasterizer
 from tests.refusals import refuses
@@ -99,6 +100,16 @@ def test_coefficients_that_gaussians_share_are_kept(tmp_path: Path) -> None:
     error = (read_sog(tmp_path).sh[:, 1:] - shared).abs()
     assert float(error.max()) < 0.03  # 0.0215 seen: the codebook's largest step
     assert float(error.mean()) < 0.005
+
+
+@pytest.mark.parametrize("most", [16, 256, 1024])
+def test_a_palette_has_no_more_sets_than_labels_can_name(most: int) -> None:
+    """Coefficients of all magnitudes, of which many groups have few members."""
+    generator = torch.Generator().manual_seed(1)
+    above, below = torch.randn(2, 50_000, 1, 1, generator=generator).abs()
+    sets, labels = palette(torch.randn(50_000, 3, 3, generator=generator) * above / below.clamp(min=1e-9), most)
+    assert most // 2 < len(sets) <= most
+    assert 0 <= labels.min() <= labels.max() < len(sets)
 
 
 def test_one_gaussian_and_equal_gaussians(tmp_path: Path) -> None:
