@@ -183,6 +183,15 @@ def test_leaves_are_small_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert sum(volumes) < 0.7 * float(np.prod(np.ptp(whole.numpy(), axis=0)))  # 0.58 seen
 
 
+def test_bounds_of_a_gaussian_that_diverged_are_numbers_of_json(tmp_path: Path) -> None:
+    field = blob_field(20)
+    field.log_scales[3] = 50.0
+    save_streamed_sog({0: field}, tmp_path)
+    meta = json.loads((tmp_path / "lod-meta.json").read_text(), parse_constant=pytest.fail)
+    for low, high, mean in zip(*meta["tree"]["bound"].values(), field.means[3].tolist(), strict=True):
+        assert (low, high) == pytest.approx((mean - math.exp(50), mean + math.exp(50)), rel=1e-6)
+
+
 def test_an_earlier_export_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_streamed_sog({0: fields(5, 0, 200, 2.0), 1: fields(6, 0, 50, 2.0)}, tmp_path)
     monkeypatch.setattr(sog, "save_sog", lambda *_, **__: pytest.fail("stopped"))
