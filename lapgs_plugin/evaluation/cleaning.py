@@ -30,7 +30,7 @@ from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rasterizers.choice import rasterizer_for
+from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS, rasterizer_for
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_scene
@@ -91,8 +91,10 @@ def clean_levels(
     """
     manifest = archive.manifest
     inside = {level: _inside(field, level, crop) for level, field in fields.items()}
-    placed = rasterizer_for(manifest)
     levels = max(fields) + 1  # one of a merged field
+    if levels < manifest.levels:  # such a field is fitted without the settings of the run's rasterizer
+        manifest = replace(manifest, settings={**manifest.settings, RASTER_SETTINGS: {}})
+    placed = rasterizer_for(manifest)
     before = HierarchyRenderer.of(manifest, fields, placed.rasterizer, FieldOffload(placed.device), levels)
     with one_pool():
         scene = run_scene(archive, moved_to)

@@ -14,14 +14,18 @@ import pytest
 import torch
 
 from lapgs_plugin.errors import RunFolderError, UserInputError
+from lapgs_plugin.evaluation import cleaning
 from lapgs_plugin.evaluation.metrics import psnr
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.rasterizers.choice import PlacedRasterizer, is_antialiased, rasterizer_for
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.run import run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.manifest import Manifest
 from tests.cli import run_folder
 from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
+from tests.cli.test_export_lod import antialias
 from tests.folders import files_in
 from tests.refusals import refuses
 from tests.training_scene import blob_field, ring_camera
@@ -92,6 +96,23 @@ def test_the_merged_field_and_its_page_are_cleaned(run: Path) -> None:
     floaters, outside, count, *_ = lines(output)["merged field"]
     assert int(count) == 450
     assert len(merged) == 450 - int(floaters) - int(outside)
+
+
+def test_the_merged_field_is_measured_as_it_is_fitted_without_antialiasing(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a CPU nothing renders with antialiasing, so the test looks at what is asked for."""
+    asked: list[bool] = []
+
+    def choose(manifest: Manifest) -> PlacedRasterizer:
+        asked.append(is_antialiased(manifest))
+        return rasterizer_for(manifest)
+
+    monkeypatch.setattr(cleaning, "rasterizer_for", choose)
+    antialias(run)
+    lapgs_export(run, "--clean")
+    lapgs_export(run, "--merge", "--iterations", 1, "--clean")
+    assert asked == [True, False]
 
 
 def test_a_page_of_a_cropped_level(nested: Path, tmp_path: Path) -> None:
