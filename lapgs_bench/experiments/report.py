@@ -127,7 +127,7 @@ def _part(results: Results, scene: str, backbone: str, options: RenderOptions) -
     if pair:
         try:
             renderers = [run_renderer(run.archive, options.device, options.rasterizer) for run in pair]
-            strips = view_strips(pair[0], renderers, None, most=1)
+            strips = view_strips(pair, renderers, None, most=1)
         except LapgsError as error:
             notes.append(f"no pictures: {error}")
     return {

@@ -10,11 +10,13 @@ import typer
 
 from lapgs_plugin.cli.bridge import takes_settings
 from lapgs_plugin.cli.output import make_console, say
-from lapgs_plugin.errors import UserInputError, counted
+from lapgs_plugin.errors import UserInputError, counted, errors_about
 from lapgs_plugin.options import check_values, option, refuse
 from lapgs_plugin.runs.layout import require_place
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from lapgs_plugin.fields.gaussian_field import GaussianField
     from lapgs_plugin.runs.archive import RunArchive
 
@@ -139,6 +141,7 @@ def _write_levels(archive: RunArchive, settings: ExportSettings, folder: Path) -
     fields = {level: archive.field(level) for level in levels}  # a damaged one is refused before anything is written
     fields = _cleaned(archive, fields, settings)
     antialiased = is_antialiased(archive.manifest)
+    _require_held(fields, settings.file_format)
     _make(folder)
     for level, field in fields.items():
         path = folder / f"{_level_name(archive, level)}{SUFFIXES[settings.file_format]}"
@@ -215,6 +218,7 @@ def _write_lod(archive: RunArchive, settings: ExportSettings, folder: Path) -> N
     antialiased = set(fields) if is_antialiased(archive.manifest) else set()
     if settings.merge:
         antialiased -= {0}  # the merged field is fitted without
+    _require_held(fields, SPZ_4, GLB)
     _make(folder)
     with one_line_errors(folder):
         save_streamed_sog(fields, folder, antialiased=antialiased)
@@ -248,6 +252,19 @@ def _levels_of_detail(archive: RunArchive, settings: ExportSettings) -> dict[int
             "one field to the run, which is then the finest level of detail"
         )
     return _cleaned(archive, fields, settings)
+
+
+def _require_held(fields: Mapping[int, GaussianField], *file_formats: str) -> None:
+    """Refuse fields by level that a format cannot hold, before the file of another level is written."""
+    from lapgs_plugin.fields.gltf import require_glb
+    from lapgs_plugin.fields.spz import require_spz
+
+    for level, field in sorted(fields.items()):
+        with errors_about(f"level {level}"):
+            if not {SPZ, SPZ_4}.isdisjoint(file_formats):
+                require_spz(field)
+            if GLB in file_formats:
+                require_glb(field)
 
 
 def _make(folder: Path) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import UserInputError, counted
 from lapgs_plugin.evaluation.figures import level_psnrs, photo_looks
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.crop import Crop
@@ -30,7 +30,7 @@ from lapgs_plugin.fields.spherical_harmonics import SH_C0
 from lapgs_plugin.hierarchy.cameras import level_camera
 from lapgs_plugin.jit.threads import one_pool
 from lapgs_plugin.progress import item_progress
-from lapgs_plugin.rasterizers.choice import rasterizer_for
+from lapgs_plugin.rasterizers.choice import RASTER_SETTINGS, rasterizer_for
 from lapgs_plugin.rendering.field_renderer import FieldOffload
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
 from lapgs_plugin.rendering.run import run_scene
@@ -86,13 +86,15 @@ def clean_levels(
         The cleaned levels, and the number of training views.
 
     Raises:
-        UserInputError: nothing of a level is left.
+        UserInputError: nothing is left of a level that had Gaussians.
         RunFolderError, SceneError: the scene cannot be read.
     """
     manifest = archive.manifest
     inside = {level: _inside(field, level, crop) for level, field in fields.items()}
-    placed = rasterizer_for(manifest)
     levels = max(fields) + 1  # one of a merged field
+    if levels < manifest.levels:  # such a field is fitted without the settings of the run's rasterizer
+        manifest = replace(manifest, settings={**manifest.settings, RASTER_SETTINGS: {}})
+    placed = rasterizer_for(manifest)
     before = HierarchyRenderer.of(manifest, fields, placed.rasterizer, FieldOffload(placed.device), levels)
     with one_pool():
         scene = run_scene(archive, moved_to)
@@ -100,6 +102,9 @@ def clean_levels(
         nothing = {level: torch.zeros_like(mask) for level, mask in inside.items()}
         floating = find_floaters(before, cameras) if floaters else nothing
         left = {level: fields[level].kept(inside[level] & ~floating[level]) for level in fields}
+        for level, field in left.items():
+            if len(fields[level]) and not len(field):
+                raise UserInputError(_nothing_left(level, int(inside[level].sum()), crop))
         after = replace(before, fields=left, offload=FieldOffload(placed.device))
         looks = photo_looks(archive, [view.name for view in scene.train])
         both = []
@@ -121,12 +126,21 @@ def _inside(field: GaussianField, level: int, crop: Crop | None) -> Tensor:
     inside = crop.contains(field.means)
     if len(field) and not bool(inside.any()):
         low, high = np.quantile(field.means.numpy(), (0.1, 0.9), axis=0).tolist()
-        wanted = ",".join(f"{number:g}" for number in crop.numbers)
         raise UserInputError(
-            f"--crop {wanted}: none of the {len(field):,} Gaussians of level {level} is inside; expected some of them, "
-            f"most are in the box {','.join(f'{value:.3g}' for value in (*low, *high))}; see `lapgs view --crop`"
+            f"--crop {crop.text}: none of the {len(field):,} Gaussians of level {level} is inside; expected some of "
+            f"them, most are in the box {','.join(f'{value:.3g}' for value in (*low, *high))}; see `lapgs view --crop`"
         )
     return inside
+
+
+def _nothing_left(level: int, inside: int, crop: Crop | None) -> str:
+    """Describe a level of which all Gaussians inside of the crop are floaters; an empty file would show nothing."""
+    where = "" if crop is None else f" inside of --crop {crop.text}"
+    larger = "" if crop is None else ", or choose a larger --crop"
+    return (
+        f"--clean: all {counted(inside, 'Gaussian')} of level {level}{where} are floaters, expected some that are not; "
+        f"export it without --clean{larger}"
+    )
 
 
 def find_floaters(renderer: HierarchyRenderer, cameras: Sequence[Camera]) -> dict[int, Tensor]:

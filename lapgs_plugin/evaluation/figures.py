@@ -96,8 +96,7 @@ def evaluate_run(
         smallest = min(min(view.camera.size) for view in photos)
         distances = lpips_metrics(lpips or LpipsRequest(), smallest, renderer.device)
         names = [view.name for view in photos]
-        # What the run learned of a photo says nothing about one of the same name in another scene.
-        looks = dict.fromkeys(names, AS_RENDERED) if split == "other" else photo_looks(archive, names)
+        looks = measured_looks(archive, split, names)
         with item_progress("views") as progress:
             measured = [
                 _measure_view(view, renderer.render(view.camera), renderer, distances, looks[view.name])
@@ -185,6 +184,12 @@ class PhotoLook:
     falloff: float
     exposure: Tensor | None
 
+    @property
+    def remark(self) -> str:
+        """What a caption adds for a render with this look; empty where it is as rendered."""
+        known = ["exposure"] * (self.exposure is not None) + ["falloff of the corners"] * (self.falloff != 0.0)
+        return f", with the photo's {' and '.join(known)} as measured" if known else ""
+
     def of(self, image: Tensor) -> Tensor:
         """Return a rendered image (3, h, w) as it is photographed."""
         image = vignette(image, [self.falloff])
@@ -201,6 +206,13 @@ def photo_looks(archive: RunArchive, views: Iterable[str]) -> dict[str, PhotoLoo
     learned = archive.exposure(archive.available_levels[-1])
     exposures = {} if learned is None else predicted_exposures(learned, views)
     return {name: PhotoLook(falloffs.get(name, 0.0), exposures.get(name)) for name in views}
+
+
+def measured_looks(archive: RunArchive, split: str, views: Iterable[str]) -> dict[str, PhotoLook]:
+    """Return the looks with which views of a split are measured, see "split" of the module's docstring."""
+    if split == "other":  # what the run learned of a photo says nothing about one of the same name in another scene
+        return dict.fromkeys(views, AS_RENDERED)
+    return photo_looks(archive, views)
 
 
 def _photographed(composition: Composition, look: PhotoLook) -> Mapping[int, Tensor]:

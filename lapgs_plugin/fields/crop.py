@@ -53,6 +53,11 @@ class Crop:
                     raise UserInputError(f"--crop {text}: {axis}0 is {low:g} and {axis}1 is {high:g}, {expected}")
         return cls(numbers)
 
+    @property
+    def text(self) -> str:
+        """The value of `--crop`."""
+        return ",".join(f"{number:g}" for number in self.numbers)
+
     def contains(self, points: Tensor) -> Tensor:
         """Return which of the points (n, 3) lie inside, (n,) bool."""
         if len(self.numbers) == 4:

@@ -48,8 +48,7 @@ def save_glb(field: GaussianField, path: Path, note: str) -> None:
     """
     field = y_up(field.detach().to("cpu", torch.float32))
     field.require_finite()
-    if len(field) == 0:
-        raise FieldError("the field has no Gaussians, expected one at least: glTF cannot hold none; export PLY")
+    require_glb(field)
     arrays = _attributes(field)
     text = json.dumps(_document(arrays, note), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -63,6 +62,16 @@ def save_glb(field: GaussianField, path: Path, note: str) -> None:
         stream.write(struct.pack("<I4s", length, b"BIN\0"))
         for array in arrays.values():
             stream.write(array.tobytes())
+
+
+def require_glb(field: GaussianField) -> None:
+    """Check that a file can hold a field, for callers that write several.
+
+    Raises:
+        FieldError: it has no Gaussian.
+    """
+    if len(field) == 0:
+        raise FieldError("the field has no Gaussians, expected one at least: glTF cannot hold none; export PLY")
 
 
 def _attributes(field: GaussianField) -> dict[str, NDArray[Any]]:

@@ -88,10 +88,12 @@ def palette(coefficients: Tensor, most: int = MOST_SETS) -> tuple[NDArray[np.flo
     generator = torch.Generator().manual_seed(0)
     _, groups = _clusters(rows, math.isqrt(count), generator)
     labels, parts, used = torch.empty(len(rows), dtype=torch.long), [], 0
+    taken = int((torch.bincount(groups) > 0).sum())  # each group has one set; they share the others by their sizes
     for group in range(int(groups.max()) + 1):
         members = (groups == group).nonzero()[:, 0]
         if len(members):
-            centres, own = _clusters(rows[members], max(1, count * len(members) // len(rows)), generator)
+            more = (count - taken) * (len(members) - 1) // max(len(rows) - taken, 1)
+            centres, own = _clusters(rows[members], 1 + more, generator)
             labels[members] = own + used
             parts.append(centres)
             used += len(centres)

@@ -197,10 +197,13 @@ def _bound(low: NDArray[Any], high: NDArray[Any]) -> dict[str, list[float]]:
 
 
 def _reach(one: GaussianField) -> Tensor:
-    """Return the standard deviation of each Gaussian along the axes of the world, (n, 3)."""
+    """Return the standard deviation of each Gaussian along the axes of the world, (n, 3) float64.
+
+    The square of one that diverged in training exceeds float32, and JSON has no infinity.
+    """
     xyzw = one.quaternions.double().numpy()[:, [1, 2, 3, 0]] + NOT_ZERO
-    rotations = torch.from_numpy(Rotation.from_quat(xyzw).as_matrix()).float()
-    reach: Tensor = (rotations * one.log_scales.exp()[:, None]).norm(dim=2)
+    rotations = torch.from_numpy(Rotation.from_quat(xyzw).as_matrix())
+    reach: Tensor = (rotations * one.log_scales.double().exp()[:, None]).norm(dim=2)
     return reach
 
 

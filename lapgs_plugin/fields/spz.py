@@ -79,6 +79,15 @@ def save_spz(field: GaussianField, path: Path, comment: str, version: int = 3, *
             stream.write(_with_table(facts, [content for content in streams if content]))
 
 
+def require_spz(field: GaussianField) -> None:
+    """Check that a file can hold a field, for callers that write several.
+
+    Raises:
+        FieldError: a position is too far from the origin.
+    """
+    _fractional_bits(field)
+
+
 def _with_table(facts: tuple[int, int, int, int], streams: list[bytes]) -> bytes:
     """Return a file of version 4: `facts` are the number of Gaussians, the SH degree, fractional bits and flags."""
     import zstandard

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lapgs_plugin.evaluation.figures import PhotoLook
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.ops.composition import to_full_size
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
@@ -107,22 +108,29 @@ class Layer:
 
 
 @torch.no_grad()
-def make_strip(view: View, why: str, figures: str, renderers: Sequence[HierarchyRenderer]) -> Strip:
+def make_strip(
+    view: View,
+    why: str,
+    figures: str,
+    renderers: Sequence[HierarchyRenderer],
+    looks: Sequence[PhotoLook],
+) -> Strip:
     """Render a view with a run, and with its baseline if there is one.
 
     Args:
         view: a view with its photo.
         why, figures: see `Strip`.
         renderers: of the run, then of its baseline.
+        looks: the photo's looks with which these were measured; renders get them, too.
     """
-    layers = _layers(view, renderers)
+    layers = _layers(view, renderers, looks)
     cutouts = tuple(cut_out(layers, square) for square in edge_squares(view.image, CUTOUTS))
     return Strip(view.name, why, figures, tuple(shrink(layer) for layer in layers), cutouts)
 
 
-def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[Layer]:
-    """Render the layers of a view, upsampled to full resolution."""
-    renderer = renderers[0]
+def _layers(view: View, renderers: Sequence[HierarchyRenderer], looks: Sequence[PhotoLook]) -> list[Layer]:
+    """Render the layers of a view, upsampled to full resolution, with the looks of `make_strip`."""
+    renderer, look = renderers[0], looks[0]
     composition = renderer.render(view.camera)
     layers = [Layer("Photo", "ground truth", view.image)]
 
@@ -131,16 +139,17 @@ def _layers(view: View, renderers: Sequence[HierarchyRenderer]) -> list[Layer]:
 
     coarsest = renderer.levels - 1
     if composition.residuals:
-        layers.append(Layer("Base", _level_label(coarsest, composition.base), whole(composition.base, coarsest)))
+        base = look.of(whole(composition.base, coarsest))
+        layers.append(Layer("Base", _level_label(coarsest, composition.base), base))
     for level, residual in composition.residuals.items():
         detail = f"{_level_label(level, residual)}, zero is grey"
-        layers.append(
-            Layer("Difference" if renderer.nested else "Residual", detail, around_grey(whole(residual, level)))
-        )
-    layers.append(Layer("Composition", "rendered by the run", composition.composed[0].cpu()))
-    for baseline in renderers[1:]:
-        image = baseline.render(view.camera).composed[0].cpu()
-        layers.append(Layer("Baseline", "rendered by the baseline", image))
+        added = whole(residual, level)
+        added = look.of(added) - look.of(torch.zeros_like(added))  # a look's constant is in the base already
+        layers.append(Layer("Difference" if renderer.nested else "Residual", detail, around_grey(added)))
+    layers.append(Layer("Composition", f"rendered by the run{look.remark}", look.of(composition.composed[0].cpu())))
+    for baseline, its_look in zip(renderers[1:], looks[1:], strict=True):
+        image = its_look.of(baseline.render(view.camera).composed[0].cpu())
+        layers.append(Layer("Baseline", f"rendered by the baseline{its_look.remark}", image))
     return layers
 
 

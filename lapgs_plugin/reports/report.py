@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 
 from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.evaluation.figures import measured_looks
 from lapgs_plugin.evaluation.lpips import lpips_titles
 from lapgs_plugin.files import write_text
 from lapgs_plugin.hierarchy.plan import Hierarchy
@@ -115,7 +116,7 @@ def write_report(run: MeasuredRun, baseline: MeasuredRun | None, options: Render
         weak=_weak_levels(run),
         breakdown=breakdown_bars(runs),
         overhead=overhead_bars(runs),
-        strips=view_strips(run, renderers, options.scene),
+        strips=view_strips(runs, renderers, options.scene),
         views=view_table(runs),
         settings=_settings(run),
         advised=knows_options(run.archive.manifest),
@@ -251,19 +252,20 @@ def overhead_bars(runs: Sequence[MeasuredRun]) -> BarChart | None:
 
 
 def view_strips(
-    run: MeasuredRun, renderers: Sequence[HierarchyRenderer], moved_to: Path | None, most: int = 3
+    runs: Sequence[MeasuredRun], renderers: Sequence[HierarchyRenderer], moved_to: Path | None, most: int = 3
 ) -> list[Strip]:
-    """Render the worst, the median and the best view of the run, with its baseline.
+    """Render the worst, the median and the best view of the run, with its baseline, as they were measured.
 
     Args:
-        run: the run whose metrics choose the views.
-        renderers: of the run, then of its baseline.
+        runs: the run whose metrics choose the views, then its baseline.
+        renderers: theirs.
         moved_to: the scene's folder now; None when it did not move.
         most: number of these views, from the worst on.
 
     Raises:
         RunFolderError: the scene is missing.
     """
+    run = runs[0]
     shown = dict(list(_select_views(run.metrics).items())[:most])
     figures = {view["name"]: f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}" for view in run.metrics["views"]}
     with one_pool():
@@ -274,9 +276,10 @@ def view_strips(
                 f"{run.archive.path(METRICS)} measures the view {shortened(unknown[0])}, which {scene.path} does not "
                 "have; write it again with `lapgs eval`"
             )
+        looks = [measured_looks(one.archive, one.metrics["split"], shown) for one in runs]
         with item_progress("views") as progress:
             return [
-                make_strip(views[name], why, figures[name], renderers)
+                make_strip(views[name], why, figures[name], renderers, [own[name] for own in looks])
                 for name, why in progress.track(list(shown.items()), description="Rendering views for the report")
             ]
 

@@ -30,7 +30,7 @@ class Controls:
         run: the run that is shown.
         other: the run on the right of the split view, or None.
         views: names of the scene's cameras.
-        before: the panel to replace, because the number of levels changed; its choices are kept.
+        before: the panel to replace, because the levels or the cameras changed; its choices are kept.
         changed: called when a new picture is needed.
         go_to: called with the index of a camera to move to.
         show_cameras: called with whether to show the cameras' frustums.
@@ -56,6 +56,8 @@ class Controls:
         self._run = run
         self._changed = changed
         self._parts: list[Any] = []
+        self._frustums: Any = None
+        self._view: Any = None
         if before is not None:
             before.close()
         with self._room(client.camera):
@@ -67,9 +69,9 @@ class Controls:
                 self._split, self._divider = self._add_split(other)
             if views:
                 with self._folder("Cameras"):
-                    self._add_cameras(views, go_to, show_cameras)
+                    self._add_cameras(views, before, go_to, show_cameras)
             with self._folder("Path"):
-                self._add_path(keep, save)
+                self._kept = self._add_path(keep, save)
             with self._folder("Figures"):
                 self._figures = self._gui.add_markdown("")
         if before is not None:
@@ -95,6 +97,11 @@ class Controls:
         level = None if self._level.value == BY_SIZE else int(self._level.value.removeprefix("level "))
         divider = self.divider if self._split is not None and self._split.value else None
         return PictureSettings(gains, shown.get(self._show.value), level, divider)
+
+    @property
+    def shows_cameras(self) -> bool:
+        """Whether the cameras' frustums are chosen."""
+        return self._frustums is not None and bool(self._frustums.value)
 
     @property
     def divider(self) -> float:
@@ -147,6 +154,7 @@ class Controls:
         for choice, old in ((self._show, before._show), (self._level, before._level)):
             if old.value in choice.options and not (choice is self._level and was_finest):
                 choice.value = old.value
+        self._kept.content = before._kept.content
         if self._split is not None and before._split is not None:
             self._split.value, self.divider = before._split.value, before.divider
 
@@ -172,11 +180,20 @@ class Controls:
         return handle
 
     def _add_cameras(
-        self, views: Sequence[str], go_to: Callable[[int], None], show_cameras: Callable[[bool], None]
+        self,
+        views: Sequence[str],
+        before: Controls | None,
+        go_to: Callable[[int], None],
+        show_cameras: Callable[[bool], None],
     ) -> None:
-        frustums = self._gui.add_checkbox("frustums", initial_value=False)
+        # The choices of the panel before are initial values: setting the view would move the camera.
+        shown = before is not None and before.shows_cameras
+        self._frustums = frustums = self._gui.add_checkbox("frustums", initial_value=shown)
         frustums.on_update(lambda _: show_cameras(frustums.value))
-        chosen: Any = self._gui.add_dropdown("view", tuple(views), initial_value=views[0])
+        last = None if before is None or before._view is None else before._view.value
+        first = last if last in views else views[0]
+        chosen: Any = self._gui.add_dropdown("view", tuple(views), initial_value=first)
+        self._view = chosen
         step = self._gui.add_button_group("go", ("previous", "here", "next"))
 
         def go_on(_: object) -> None:
@@ -190,7 +207,7 @@ class Controls:
         step.on_click(go_on)
         chosen.on_update(lambda _: go_to(views.index(chosen.value)))
 
-    def _add_path(self, keep: Callable[[], int], save: Callable[[], None]) -> None:
+    def _add_path(self, keep: Callable[[], int], save: Callable[[], None]) -> Any:
         count = self._gui.add_markdown("Keep views to render a clip through them.")
         buttons = self._gui.add_button_group("views", ("keep", "save"))
 
@@ -201,6 +218,7 @@ class Controls:
                 save()
 
         buttons.on_click(keep_or_save)
+        return count
 
     def _band_name(self, level: int) -> str:
         if self._run.renderer.levels == 1:

@@ -86,8 +86,8 @@ class FollowedRun:
         self._read()
         return True
 
-    def set_cameras(self, rig: Rig) -> None:
-        """Set the training cameras."""
+    def set_cameras(self, rig: Rig | None) -> None:
+        """Set the training cameras; None if they are not known."""
         self._rig = rig
         if self.shown is not None:
             self.shown = ShownRun.of(self.shown.name, self.shown.renderer, rig)
@@ -143,6 +143,7 @@ class RunFollower:
         self._viewer, self._page, self._report = viewer, page, report
         self._runs = [run] if other is None else [run, other]
         self._cameras: SceneCameras | None = None
+        self._created = ""  # time of the training whose cameras were read
         self._said: set[str] = set()
         self._placed_clients = False
 
@@ -152,16 +153,7 @@ class RunFollower:
         Raises:
             RunFolderError, SceneError: the given scene is not the run's.
         """
-        scene = self._runs[0].options.scene
-        try:
-            self._cameras = SceneCameras.of(self._runs[0].archive, scene)
-        except (RunFolderError, SceneError) as error:
-            if scene is not None:
-                raise
-            self._report(f"without the scene's cameras: {error}")
-        else:
-            for run in self._runs:
-                run.set_cameras(self._cameras.rig)
+        self._read_cameras()
         self._show()
 
     def warm_up(self) -> None:
@@ -182,14 +174,38 @@ class RunFollower:
     def watch(self, stop: threading.Event) -> None:
         """Show changes until `stop` is set."""
         while not stop.wait(POLL_SECONDS):
+            changed, problems = False, []
+            for run in self._runs:
+                try:
+                    changed |= run.refresh()
+                except LapgsError as error:  # a run that is removed or restarted stays visible
+                    problems.append(str(error))
             try:
-                changed = [run.refresh() for run in self._runs]
-                if any(changed):
+                if changed:
                     self._show()
-            except LapgsError as error:  # a run that is removed or restarted stays visible
-                self._set_status(str(error))
+            except LapgsError as error:
+                problems.append(str(error))
+            if problems:
+                self._set_status("; ".join(problems))
+
+    def _read_cameras(self) -> None:
+        """Read the cameras of the first run; arguments and errors as `begin`."""
+        archive, scene = self._runs[0].archive, self._runs[0].options.scene
+        self._created, self._cameras = archive.manifest.created, None
+        try:
+            self._cameras = SceneCameras.of(archive, scene)
+        except (RunFolderError, SceneError) as error:
+            if scene is not None:
+                raise
+            self._report(f"without the scene's cameras: {error}")
+        for run in self._runs:
+            run.set_cameras(None if self._cameras is None else self._cameras.rig)
 
     def _show(self) -> None:
+        if self._runs[0].archive.manifest.created != self._created:  # trained again, maybe on another scene
+            before = self._cameras
+            self._read_cameras()
+            self._placed_clients &= self._cameras is not None and self._cameras.begins_as(before)
         self._set_status("; ".join(run.status() for run in self._runs))
         shown, *others = [run.shown for run in self._runs]
         if shown is None:

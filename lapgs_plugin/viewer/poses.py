@@ -120,6 +120,14 @@ class SceneCameras:
         """The view from the first camera."""
         return InitialView.of_camera(next(iter(self.by_view.values())), self.rig)
 
+    def begins_as(self, other: SceneCameras | None) -> bool:
+        """Return whether clients of another scene begin at the same place, looking at the same point."""
+        if other is None:
+            return False
+        ours, theirs = self.start, other.start
+        places = np.stack([ours.position, ours.look_at]), np.stack([theirs.position, theirs.look_at])
+        return bool(np.allclose(*places, rtol=0.0, atol=1e-4 * self.rig.distance))
+
 
 def orbit_distance(position: Vector, rig: Rig) -> float:
     """Return the distance from a camera to the point that it orbits around."""

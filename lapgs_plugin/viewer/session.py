@@ -146,8 +146,13 @@ class Session:
 
     def _update_panel(self, content: ViewerContent) -> Controls:
         """Update the panel to the content."""
+        same_cameras = content.cameras is self._cameras
         self._cameras = content.cameras
-        if self._controls is None or not self._controls.fits(content.run, content.other):
+        if not same_cameras:
+            for frustum in self._frustums:
+                frustum.remove()
+            self._frustums = []
+        if self._controls is None or not (same_cameras and self._controls.fits(content.run, content.other)):
             self._controls = Controls(
                 self._client,
                 content.run,
@@ -163,6 +168,7 @@ class Session:
             if content.other is not None and self._handle is None:
                 self._handle = self._add_handle()
             self._place_handle()
+            self._show_cameras(self._controls.shows_cameras)
         return self._controls
 
     def _pose(self) -> Pose:

@@ -119,6 +119,10 @@ class Viewer:
             if self._content is not None:
                 session.show(self._content)
             start = self._start
+        # viser calls this in another thread than `_disconnect`, which may be over if the client left at once.
+        if client.client_id not in self._page.server.get_clients():
+            self._disconnect(client)
+            return
         if start is not None:
             session.move_to(start)
         self._wake()

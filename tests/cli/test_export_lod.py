@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from lapgs_plugin.errors import UserInputError
+from lapgs_plugin.errors import FieldError, UserInputError
+from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.runs.archive import RunArchive
+from tests.cli import run_folder
 from tests.cli.run_folder import write_run, write_scene
 from tests.cli.test_export import lapgs_export
 from tests.folders import files_in
 from tests.refusals import refuses
+from tests.training_scene import blob_field
 from tests.unit.test_gltf import attributes, read_glb
 from tests.unit.test_sog import read_levels
 from tests.unit.test_spz import in_our_axes, read_spz
@@ -97,6 +101,30 @@ def test_other_formats_of_a_level(nested: Path) -> None:
     assert files_in(nested / "export") == {"level_0_field.spz", "level_1_base.glb"}
     assert (nested / "export" / "level_0_field.spz").read_bytes()[:8] == b"NGSP\4\0\0\0"
     assert len(read_glb(nested / "export" / "level_1_base.glb")) == 250
+
+
+@pytest.mark.parametrize("how", ["none", "far"])
+@pytest.mark.parametrize("options", [("--lod",), ("--format", "glb"), ("--format", "spz4"), ("--format", "spz")])
+def test_no_level_is_written_if_the_format_cannot_hold_another(
+    how: str, options: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Level 0 was pruned to nothing, or one of its Gaussians is too far away for SPZ."""
+
+    def field(count: int, seed: int) -> GaussianField:
+        blob = blob_field(count, seed)
+        if count == 250:
+            return blob
+        return blob.kept(torch.arange(0)) if how == "none" else replace(blob, means=1e8 * blob.means)
+
+    monkeypatch.setattr(run_folder, "blob_field", field)
+    run = write_run(tmp_path / "run", write_scene(tmp_path / "scene"), nested=True)
+    if ("glb" in options, how) == (True, "far") or (options[-1][:3], how) == ("spz", "none"):
+        lapgs_export(run, *options)  # the format holds it
+        assert len(files_in(run / "export")) == 2
+        return
+    facts = "level 0: the field has no Gaussians" if how == "none" else "level 0: a Gaussian is .* SPZ cannot hold it"
+    refuses(FieldError, facts, lapgs_export, run, *options)
+    assert not (run / "export").exists()
 
 
 def test_mistakes(nested: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from lapgs_plugin.cli.report import report
 from lapgs_plugin.errors import RunFolderError
 from lapgs_plugin.hierarchy.plan import StagePlan
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.runs.layout import EXPOSURE, VIGNETTING
 from lapgs_plugin.runs.manifest import LevelRecord, Manifest, SceneReference
 from lapgs_plugin.scenes import load_scene
 from tests.cli.commands import succeeding
@@ -173,6 +174,26 @@ def test_every_picture_is_there_and_can_be_decoded(run: Path, baseline: Path) ->
     # The cut-out occurs there pixel by pixel, and nowhere else.
     distances = cv2.matchTemplate(original, part, cv2.TM_SQDIFF)
     assert distances.min() < 1.0
+
+
+def test_pictures_are_those_that_the_figures_beside_them_measure(run: Path, baseline: Path) -> None:
+    """The run learned that its photos are brighter than its renders; the baseline did not."""
+    names = [f"photos/{i:02d}.png" for i in range(10)]
+    learned = {name: (1.6 * np.eye(3, 4)).tolist() for name in names if name not in ("photos/00.png", "photos/08.png")}
+    (run / "level_0" / EXPOSURE).write_text(json.dumps(learned))
+    (run / VIGNETTING).write_text(json.dumps(dict.fromkeys(names, -0.7)))
+    lapgs_report(run, "--baseline", baseline)
+    images = {
+        image["alt"]: image["src"] for image in Page((run / "report.html").read_text()).all("img") if "src" in image
+    }
+    for folder, caption in ((run, "Composition"), (baseline, "Baseline")):
+        measured = {view["name"]: view["psnr"] for view in json.loads((folder / "metrics.json").read_text())["views"]}
+        for name in ("photos/00.png", "photos/08.png"):
+            data = np.frombuffer(base64.b64decode(images[f"{caption} of {name}"].partition(",")[2]), np.uint8)
+            shown = cv2.imdecode(data, cv2.IMREAD_COLOR)
+            photo = cv2.imread(str(Path(RunArchive.open(run).manifest.scene.path) / name))
+            error = np.square((shown.astype(float) - photo) / 255).mean()
+            assert -10 * np.log10(error) == pytest.approx(measured[name], abs=0.03)  # it is a JPEG; 0.007 seen
 
 
 def test_figures_are_those_of_metrics_json(run: Path, baseline: Path) -> None:

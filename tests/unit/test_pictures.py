@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lapgs_plugin.evaluation.figures import AS_RENDERED, PhotoLook
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.rendering.hierarchy_renderer import HierarchyRenderer
@@ -57,7 +58,8 @@ def test_base_and_residual_add_up_to_the_composition_pixel_by_pixel() -> None:
     fields = {1: blob_field(), 0: replace(residual, sh=0.1 * residual.sh, signed=True)}
     renderer = HierarchyRenderer(fields, 2, Pyramid(), CpuRasterizer(), background=(0.3, 0.3, 0.3))
     composed = renderer.render(camera).composed[0].clamp(0, 1)
-    strip = make_strip(View("a.png", camera, composed), "why", "figures", [renderer, renderer])
+    looks = [AS_RENDERED, AS_RENDERED]
+    strip = make_strip(View("a.png", camera, composed), "why", "figures", [renderer, renderer], looks)
     assert [picture.caption for picture in strip.pictures] == ["Photo", "Base", "Residual", "Composition", "Baseline"]
     assert strip.compared == (4, 3)
     for cutout in strip.cutouts:
@@ -71,10 +73,39 @@ def test_base_and_residual_add_up_to_the_composition_pixel_by_pixel() -> None:
         assert composition == pytest.approx(whole, abs=0.5001 / 255)
 
 
+def test_renders_have_the_look_with_which_they_were_measured() -> None:
+    """Base, residual and composition of the run get its exposure and falloff; the baseline learned neither."""
+    camera, residual = ring_camera(0.3), blob_field(seed=1)
+    fields = {1: blob_field(), 0: replace(residual, sh=0.1 * residual.sh, signed=True)}
+    renderer = HierarchyRenderer(fields, 2, Pyramid(), CpuRasterizer(), background=(0.3, 0.3, 0.3))
+    plain = renderer.render(camera).composed[0]
+    exposure = torch.tensor([[0.7, 0.1, 0.0, 0.05], [0.0, 0.8, 0.0, 0.0], [0.1, 0.0, 0.6, 0.1]])
+    looks = [PhotoLook(-1.5, exposure), AS_RENDERED]
+    strip = make_strip(View("a.png", camera, plain.clamp(0, 1)), "why", "figures", [renderer, renderer], looks)
+    assert (
+        strip.pictures[3].detail
+        == "rendered by the run, with the photo's exposure and falloff of the corners as measured"
+    )
+    assert strip.pictures[4].detail == "rendered by the baseline"
+    y, x = np.mgrid[:40, :56] + 0.5
+    distance = ((x - 28) ** 2 + (y - 20) ** 2) / (28**2 + 20**2)
+    darkened = plain.permute(1, 2, 0).double().numpy() * 2.0 ** (-1.5 * distance)[..., None]
+    matrix = exposure.double().numpy()
+    photographed = np.clip(darkened @ matrix[:, :3].T + matrix[:, 3], 0, 1)
+    for cutout in strip.cutouts:
+        _, base, residual, composition, baseline = (pixels(picture.data) for picture in cutout.pictures)
+        left, top = (round(share * size / 100) for share, size in ((cutout.left, 56), (cutout.top, 40)))
+        part = np.s_[top : top + cutout.side, left : left + cutout.side]
+        assert composition == pytest.approx(photographed[part], abs=0.501 / 255)
+        assert baseline == pytest.approx(plain.clamp(0, 1).permute(1, 2, 0).numpy()[part], abs=0.501 / 255)
+        added = np.clip(base + 2 * (residual - 128 / 255), 0, 1)
+        assert np.abs(added - composition).max() < 0.02  # three roundings to 8 bits
+
+
 def test_nested_levels_have_differences_and_no_residuals() -> None:
     camera, fields = ring_camera(0.3), {1: blob_field(), 0: blob_field(seed=1)}
     renderer = HierarchyRenderer(fields, 2, Pyramid(), CpuRasterizer(), background=(0.3, 0.3, 0.3))
     composition = renderer.render(camera)
-    strip = make_strip(View("a.png", camera, composition.composed[0]), "why", "figures", [renderer])
+    strip = make_strip(View("a.png", camera, composition.composed[0]), "why", "figures", [renderer], [AS_RENDERED])
     assert [picture.caption for picture in strip.pictures] == ["Photo", "Base", "Difference", "Composition"]
     assert set(view_images(composition, None, raw=True, nested=renderer.nested)) == {"base", "difference_0", "composed"}

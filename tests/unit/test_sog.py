@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from lapgs_plugin.errors import FieldError
 from lapgs_plugin.fields import sog
 from lapgs_plugin.fields.gaussian_field import GaussianField
+from lapgs_plugin.fields.quantization import palette
 from lapgs_plugin.fields.sog import save_sog, save_streamed_sog
 from lapgs_plugin.reference_raster import CpuRasterizer
 from tests.refusals import refuses
@@ -101,6 +102,16 @@ def test_coefficients_that_gaussians_share_are_kept(tmp_path: Path) -> None:
     assert float(error.mean()) < 0.005
 
 
+@pytest.mark.parametrize("most", [16, 256, 1024])
+def test_a_palette_has_no_more_sets_than_labels_can_name(most: int) -> None:
+    """Coefficients of all magnitudes, of which many groups have few members."""
+    generator = torch.Generator().manual_seed(1)
+    above, below = torch.randn(2, 50_000, 1, 1, generator=generator).abs()
+    sets, labels = palette(torch.randn(50_000, 3, 3, generator=generator) * above / below.clamp(min=1e-9), most)
+    assert most // 2 < len(sets) <= most
+    assert 0 <= labels.min() <= labels.max() < len(sets)
+
+
 def test_one_gaussian_and_equal_gaussians(tmp_path: Path) -> None:
     one = fields(4, 3, 1, 1.0)
     for name, field in (("one", one), ("equal", one.kept(torch.zeros(500, dtype=torch.long)))):
@@ -170,6 +181,15 @@ def test_leaves_are_small_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     whole = torch.cat([part.means for part in levels[0]])
     volumes = [float(np.prod(np.ptp(part.means.numpy(), axis=0))) for part in levels[0]]
     assert sum(volumes) < 0.7 * float(np.prod(np.ptp(whole.numpy(), axis=0)))  # 0.58 seen
+
+
+def test_bounds_of_a_gaussian_that_diverged_are_numbers_of_json(tmp_path: Path) -> None:
+    field = blob_field(20)
+    field.log_scales[3] = 50.0
+    save_streamed_sog({0: field}, tmp_path)
+    meta = json.loads((tmp_path / "lod-meta.json").read_text(), parse_constant=pytest.fail)
+    for low, high, mean in zip(*meta["tree"]["bound"].values(), field.means[3].tolist(), strict=True):
+        assert (low, high) == pytest.approx((mean - math.exp(50), mean + math.exp(50)), rel=1e-6)
 
 
 def test_an_earlier_export_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.rasterizers.choice import PlacedRasterizer
 from lapgs_plugin.reference_raster import CpuRasterizer
 from lapgs_plugin.runs.archive import RunArchive
+from lapgs_plugin.scenes.scene import load_cameras
 from tests.cli.run_folder import write_run, write_scene
 
 pytest.importorskip("viser", reason="needs the extra 'viewer'")
@@ -168,6 +172,61 @@ def test_the_watching_thread_shows_each_new_level_and_survives_the_end_of_the_fo
     assert len(viewer.shown[0].cameras.by_view) == 10
     assert viewer.starts == 1
     assert said[:2] == ["run is not complete: showing level 1 of 2; others will follow", "run: 2 levels"]
+
+
+@contextmanager
+def watched(follow: RunFollower) -> Iterator[None]:
+    stop = threading.Event()
+    thread = threading.Thread(target=follow.watch, args=(stop,))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_a_new_level_is_shown_though_the_baseline_is_gone(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(following, "POLL_SECONDS", 0.02)
+    complete, baseline = write_run(tmp_path / "complete", scene), write_run(tmp_path / "baseline", scene)
+    folder = write_run(tmp_path / "run", scene, finished=1)
+    runs = [FollowedRun(path, RenderOptions(device="cpu")) for path in (folder, baseline)]
+    viewer, page = FakeViewer(), FakePage()
+    follow = RunFollower(viewer, page, *runs, report=lambda _: None)  # type: ignore[arg-type]  # fakes
+    follow.begin()
+    with watched(follow):
+        (baseline / "manifest.json").rename(tmp_path / "gone.json")
+        wait_for(lambda: "not a run" in page.status)
+        finish(folder, complete)
+        wait_for(lambda: len(viewer.shown) == 2)
+    assert list(viewer.shown[1].run.counts) == [1, 0]
+    assert list(viewer.shown[1].other.counts) == [1, 0], "the baseline as it was"
+    assert "not a run" in page.status
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_run_that_is_trained_again_is_shown_with_the_cameras_of_its_scene(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, same: bool
+) -> None:
+    """Clients move to the first camera of another scene, and stay where they are in the same one."""
+    monkeypatch.setattr(following, "POLL_SECONDS", 0.02)
+    folder = write_run(tmp_path / "run", scene)
+    made = json.loads((folder / "manifest.json").read_text())["created"]
+    viewer, page = FakeViewer(), FakePage()
+    follow = RunFollower(viewer, page, FollowedRun(folder, RenderOptions(device="cpu")), None, lambda _: None)  # type: ignore[arg-type]  # fakes
+    follow.begin()
+    other = scene if same else write_scene(tmp_path / "other", [f"{i}.png" for i in range(6, 0, -1)])
+    wait_for(lambda: datetime.now(timezone.utc).isoformat(timespec="seconds") > made)
+    with watched(follow):
+        folder.rename(tmp_path / "before")
+        wait_for(lambda: "not a run" in page.status)
+        write_run(folder, other)
+        wait_for(lambda: page.status == "run: 2 levels" and list(viewer.shown[-1].run.counts) == [1, 0])
+    expected = load_cameras(other, resolution="full", eval=True)
+    assert viewer.shown[-1].cameras.by_view.keys() == {*expected[0], *expected[1]}
+    assert viewer.starts == (1 if same else 2)
 
 
 def test_without_a_level_to_show_damage_is_an_error(scene: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -120,6 +121,28 @@ def test_a_browser_that_is_closed_and_one_that_comes_back(page: Page, tmp_path: 
             assert again.listen(PATIENCE, pictures=1) == 1
 
     watched_run(tmp_path / "run", page, watcher, look, iterations=300)
+
+
+def test_a_browser_that_leaves_before_it_was_noticed_watches_no_more(page: Page) -> None:
+    """viser calls back in threads: that of the connection may come after that of its end."""
+    viewer, noticed, ended = Viewer(page), threading.Event(), threading.Event()
+
+    def late(client: Any) -> None:
+        ended.wait(PATIENCE)
+        viewer._connect(client)
+        noticed.set()
+
+    def at_once(client: Any) -> None:
+        viewer._disconnect(client)
+        ended.set()
+
+    page.server._client_connect_cb[:], page.server._client_disconnect_cb[:] = [late], [at_once]
+    with wire_client(page.address):
+        wait_for(lambda: bool(page.server.get_clients()))
+    assert noticed.wait(PATIENCE)
+    assert not viewer.watched
+    with wire_client(page.address):
+        wait_for(lambda: viewer.watched)
 
 
 def test_a_pause_holds_training_until_it_is_ended_or_nobody_watches(page: Page, tmp_path: Path) -> None:
