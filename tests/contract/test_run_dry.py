@@ -151,7 +151,7 @@ def test_what_fails_is_one_line_with_its_place(failure: str, scene: Path, tmp_pa
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_rasterizer_whose_backward_pass_is_not_patched_gets_colours(
-    whole: bool, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    whole: bool, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It takes the degree of a signed call for 0, as one that does not know the flag."""
     with captured(tmp_path, []), loaded(STUBS["graphdeco"], scene, tmp_path / "run", *SHORT) as adapter:
@@ -166,7 +166,7 @@ def test_a_rasterizer_whose_backward_pass_is_not_patched_gets_colours(
             differentiable = forward(constant, *arguments, **inputs)[0]
             return image.detach() + differentiable - differentiable.detach(), *others
 
-        kind.forward = half_patched
+        monkeypatch.setattr(kind, "forward", half_patched)
         with pytest.raises(KeyboardInterrupt):
             drive(adapter, hooks=(StopAt(1),), hierarchy="laplacian")
     warned = ["diff_gaussian_rasterization has no signed colour" in record.getMessage() for record in caplog.records]
