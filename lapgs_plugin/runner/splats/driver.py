@@ -36,6 +36,7 @@ from lapgs_plugin.errors import DeviceMemoryError, UserInputError, first_line
 from lapgs_plugin.fields.gaussian_field import GaussianField, splats_from_field
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runner.splats.joint import COLORS
 from lapgs_plugin.runner.splats.run import SplatRequest, SplatRun, prepare
 from lapgs_plugin.runner.splats.schedule import set_threshold, stage_config
 from lapgs_plugin.runner.splats.signed import FinishedField, Rasterizer
@@ -279,6 +280,10 @@ class SplatDriver:
         for name, module in _beside_splats(trainer).items():
             if name in learned and _shapes(learned[name]) == _shapes(module.state_dict()):
                 module.load_state_dict(learned[name])
+        if stage.signed:
+            # Its optimizers, not its settings: programs made of older examples have rates as numbers in their code.
+            for name in COLORS:
+                _scale_rate(trainer.optimizers[name], run.window(stage).residual_color_rate)
         self._scale_sh_rate()
 
     def _inherit(self, coarser: GaussianField) -> None:
@@ -294,8 +299,13 @@ class SplatDriver:
         rate, optimizers = self._run.settings.sh_rate, self._run.trainer.optimizers
         if rate != 1.0 and "shN" not in optimizers:
             raise UserInputError(f"--sh-rate {rate:g}: the script has no optimizer of shN; leave it out")
-        for group in optimizers["shN"].param_groups if rate != 1.0 else ():
-            group["lr"] *= rate
+        if rate != 1.0:
+            _scale_rate(optimizers["shN"], rate)
+
+
+def _scale_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] *= factor
 
 
 def _beside_splats(trainer: Any) -> dict[str, torch.nn.Module]:
