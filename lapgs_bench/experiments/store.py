@@ -235,7 +235,7 @@ class ResultStore:
                         (FAILED, f"the worker that ran it died {claims} times", run_id),
                     )
                     continue
-                owner = f"{socket.gethostname()}|{os.getpid()}|{uuid.uuid4().hex}"
+                owner = f"{_machine()}|{os.getpid()}|{uuid.uuid4().hex}"
                 connection.execute(
                     "UPDATE runs SET state = ?, owner = ?, lease_until = ?, claims = ? WHERE run_id = ?",
                     (RUNNING, owner, time.time() + LEASE, claims + 1, run_id),
@@ -352,8 +352,17 @@ def _differences(one: str, other: str) -> str:
 
 def _abandoned(owner: str, lease_until: float, now: float) -> bool:
     """Tell whether a claim has expired, or its process on this machine has ended."""
-    host, pid, _ = owner.rsplit("|", 2)
-    return now > lease_until or (host == socket.gethostname() and not _alive(int(pid)))
+    machine, pid, _ = owner.rsplit("|", 2)
+    return now > lease_until or (machine == _machine() and not _alive(int(pid)))
+
+
+def _machine() -> str:
+    """Return the name of this machine, and on Linux of its container: each has numbers of processes of its own."""
+    try:
+        container = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        container = ""
+    return f"{socket.gethostname()} {container}"
 
 
 def _alive(pid: int) -> bool:

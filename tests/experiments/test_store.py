@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -116,6 +117,27 @@ def test_a_worker_that_slept_through_its_lease_records_nothing(
     assert not store.fail(slept, "late")
     (outcome,) = store.outcomes(run_ids[:1])
     assert (outcome.state, outcome.record) == (DONE, {"psnr": 2.0})
+
+
+def test_a_worker_in_another_container_is_not_taken_for_dead(
+    planned: tuple[ResultStore, list[str]], tmp_path: Path
+) -> None:
+    """Containers on the host's network have its name, but numbers of processes of their own."""
+    apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child"]
+    if (
+        sys.platform != "linux"
+        or shutil.which("unshare") is None
+        or subprocess.run([*apart, "true"], check=False).returncode
+    ):
+        pytest.skip("this machine lets nobody number processes anew")
+    store, run_ids = planned
+    claim = store.claim(run_ids[:1])
+    assert claim is not None
+    code = "import sys; from pathlib import Path; from lapgs_bench.experiments.store import ResultStore; "
+    code += "print(ResultStore(Path(sys.argv[1])).has_free(sys.argv[2:]))"
+    command = [*apart, sys.executable, "-c", code, str(tmp_path / "results.sqlite"), run_ids[0]]
+    assert subprocess.check_output(command, text=True) == "False\n"
+    assert store.renew(claim)
 
 
 def test_a_run_that_kills_its_workers_fails_in_the_end(
