@@ -209,6 +209,21 @@ def test_rates_that_are_numbers_in_a_script(scene: Path, tmp_path: Path, monkeyp
         assert torch.equal(usual.field(level).sh, fixed.field(level).sh)
 
 
+def test_a_loader_that_is_imported_by_name(
+    finished: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = edited(tmp_path / "checkout", "torch.utils.data.DataLoader(", "DataLoader(")
+    script.write_text(
+        script.read_text().replace("import torch\n", "import torch\nfrom torch.utils.data import DataLoader\n", 1)
+    )
+    monkeypatch.setattr(f"{__name__}.SCRIPT", script)
+    usual, own = (
+        RunArchive.open(each) for each in (finished, train(scene, tmp_path / "run", lapgs=hierarchy(finished.name)))
+    )
+    for level in (1, 0):
+        assert torch.equal(usual.field(level).means, own.field(level).means)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_mcmc_in_batches(kind: str, scene: Path, tmp_path: Path) -> None:
     folder = train(scene, tmp_path / "run", "--batch_size", 2, lapgs=hierarchy(kind), kind="mcmc")

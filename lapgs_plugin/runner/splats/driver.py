@@ -6,7 +6,8 @@ replaced, and restored by identity at the end:
 
     `train` of the class                                as above
     `rasterization`, as the script imports it           our kernels, signed colours, coarser levels in the image
-    `torch.utils.data.DataLoader`, of its datasets      batches of the level's images, which are in memory
+    `torch.utils.data.DataLoader`, also where the
+    script imports it, of its datasets                  batches of the level's images, which are in memory
     `__init__` of the class, `Parser`                   read a scene once
     `eval` and the like of the class                    do not count as training
     `cli`, as the script imports it                     stays in this process, on one GPU
@@ -114,6 +115,8 @@ class SplatDriver:
             Replacement(self._module, RASTERIZATION, lambda _: self._rasterize, trainer),
             Replacement(data, "DataLoader", self._loading, trainer),
         ]
+        imported = [name for name, value in of_script.items() if value is data.DataLoader]
+        replacements += [Replacement(self._module, name, self._loading, trainer) for name in imported]
         replacements += [Replacement(self._class, n, self._measuring, trainer) for n in MEASUREMENTS if n in of_class]
         if isinstance(of_script.get("Parser"), type):
             replacements.append(
