@@ -75,6 +75,19 @@ def check_runs(
                 _note(mistakes, keys, usage_message(error) if isinstance(error, USAGE_ERROR) else str(error))
 
 
+def check_run(job: Job, spec: RunSpec, folder: Path) -> None:
+    """Check the command line of one run for this machine, whose scene is in a folder.
+
+    Raises:
+        LapgsError: its command would refuse it.
+    """
+    scene = SceneSpec(spec.scene, spec.dataset, None, None, spec.resolution, spec.images)
+    try:
+        _rehearse(job, _Check(spec, partial(_smallest_size, scene, folder), here=True))
+    except USAGE_ERROR as error:
+        raise UserInputError(usage_message(error)) from error
+
+
 def _note(mistakes: Mistakes, keys: Mapping[str, str], message: str) -> None:
     """Add a message under the key of the first option in it that the experiment sets."""
     options = (match.replace("-", "_") for match in re.findall(r"--([a-z][a-z-]*[a-z])", message))

@@ -75,11 +75,12 @@ def prepare(
             own = folder.absolute() / RUNS / spec.run_id
             checkout = checkouts[spec.checkout, spec.script] if spec.checkout else None
             scene_folder = where[spec.scene][1] if spec.scene in where else MISSING
+            found = "" if spec.sample else str(scene_folder)
             steps = run_steps(spec, scene_folder, checkout, own, evaluate)
             log = str(folder.absolute() / LOGS / f"{spec.run_id}.log")
             jobs.setdefault(
                 spec.run_id,
-                Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None, defaults_of(spec)),
+                Job(spec.run_id, spec, str(own), log, tuple(steps), evaluate is not None, defaults_of(spec), found),
             )
     return list(jobs.values()), where
 

@@ -18,7 +18,9 @@ from collections.abc import Callable
 from functools import partial
 
 PR_SET_PDEATHSIG = 1
-"""Linux's prctl(2) that ends the command with this process, which Ray kills together with a worker."""
+"""Linux's prctl(2) that ends the command with this process, which Ray kills together with a worker.
+
+`interrupt.stop_with` is for processes that stop by themselves, with a checkpoint; a command may be deaf to that."""
 
 
 def main() -> int:

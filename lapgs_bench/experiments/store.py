@@ -26,7 +26,7 @@ from lapgs_bench.experiments.commands import Step
 from lapgs_bench.experiments.expansion import RunSpec
 from lapgs_plugin import __version__
 from lapgs_plugin.errors import RunFolderError
-from lapgs_plugin.files import one_line_errors, require_own
+from lapgs_plugin.files import is_folder, one_line_errors, require_own
 from lapgs_plugin.untrusted import STRICT, parse_json, shortened
 
 FORMAT_VERSION = 1
@@ -66,6 +66,7 @@ class Job:
         spec: settings in its row of results; None without such a row.
         evaluate: whether the last command is `lapgs eval`.
         defaults: see `commands.defaults_of`.
+        scene: its scene's folder; "" for a scene that is made, and in stores of earlier versions.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -77,6 +78,7 @@ class Job:
     steps: tuple[Step, ...]
     evaluate: bool
     defaults: str
+    scene: str = ""
 
     @property
     def continues(self) -> bool:
@@ -178,10 +180,13 @@ class ResultStore:
             repeat: make finished runs pending again, too.
 
         Raises:
-            RunFolderError: the other runs would have other defaults than those that are finished or running.
+            RunFolderError: runs that are finished or running are of another scene, or have other defaults than the
+                others would have.
         """
         with _transaction(self._path) as connection:
-            self._require_same_defaults(connection, jobs)
+            begun = _begun(connection)
+            self._require_same_scenes(begun, jobs)
+            self._require_same_defaults(begun, jobs)
             again = (PENDING, FAILED, DONE) if repeat else (PENDING, FAILED)
             states = ", ".join("?" * len(again))
             for position, job in enumerate(jobs):
@@ -196,9 +201,21 @@ class ResultStore:
                     (job.to_json(), PENDING, job.run_id, *again),
                 )
 
-    def _require_same_defaults(self, connection: sqlite3.Connection, jobs: Sequence[Job]) -> None:
-        rows = connection.execute("SELECT run_id, job FROM runs WHERE state IN (?, ?)", (RUNNING, DONE)).fetchall()
-        begun = {run_id: Job.from_json(text) for run_id, text in rows}
+    def _require_same_scenes(self, begun: Mapping[str, Job], jobs: Sequence[Job]) -> None:
+        # A run's name leaves the folder out, because scenes are moved and copied. Another one may have the same name.
+        pairs = {
+            (begun[job.run_id].scene, job.scene, job.spec.images)
+            for job in jobs
+            if job.spec is not None and job.scene and job.run_id in begun
+        }
+        for before, now, images in sorted(pairs):
+            if before and not _same_scene(before, now, images):
+                raise RunFolderError(
+                    f"{self._path}: its runs are of {before}, whose files differ from those of {now}; choose another "
+                    "folder with --out"
+                )
+
+    def _require_same_defaults(self, begun: Mapping[str, Job], jobs: Sequence[Job]) -> None:
         pairs = [(begun[job.run_id].defaults, job.defaults) for job in jobs if job.run_id in begun]
         others = [pair for pair in pairs if pair[0] != pair[1]]
         if others and len(pairs) < len(jobs):
@@ -218,7 +235,7 @@ class ResultStore:
                         (FAILED, f"the worker that ran it died {claims} times", run_id),
                     )
                     continue
-                owner = f"{socket.gethostname()}|{os.getpid()}|{uuid.uuid4().hex}"
+                owner = f"{_machine()}|{os.getpid()}|{uuid.uuid4().hex}"
                 connection.execute(
                     "UPDATE runs SET state = ?, owner = ?, lease_until = ?, claims = ? WHERE run_id = ?",
                     (RUNNING, owner, time.time() + LEASE, claims + 1, run_id),
@@ -291,6 +308,24 @@ def _transaction(path: Path) -> Iterator[sqlite3.Connection]:
         raise RunFolderError(f"{path} is no store of results ({error}); choose another folder") from error
 
 
+def _begun(connection: sqlite3.Connection) -> dict[str, Job]:
+    """Return the jobs that are running or done, by their runs."""
+    rows = connection.execute("SELECT run_id, job FROM runs WHERE state IN (?, ?)", (RUNNING, DONE)).fetchall()
+    return {run_id: Job.from_json(text) for run_id, text in rows}
+
+
+def _same_scene(one: str, other: str, images: str) -> bool:
+    """Tell whether two folders are one scene: the same, moved, or with photos and model of the same names and sizes."""
+    return one == other or not is_folder(Path(one)) or _sizes(Path(one), images) == _sizes(Path(other), images)
+
+
+def _sizes(scene: Path, images: str) -> dict[str, int]:
+    """Return the sizes in bytes of a scene's files by name, without the PLY files that training scripts add."""
+    parts = [path for part in (images, "sparse") for path in (scene / part).rglob("*") if path.suffix != ".ply"]
+    files = [*scene.glob("transforms*.json"), *parts]
+    return {path.relative_to(scene).as_posix(): path.stat().st_size for path in files if path.is_file()}
+
+
 def _free(connection: sqlite3.Connection, run_ids: Collection[str]) -> Iterator[tuple[str, str, int]]:
     """Yield name, job and claims of those of these runs that wait or were abandoned, in order."""
     wanted, now = set(run_ids), time.time()
@@ -317,8 +352,17 @@ def _differences(one: str, other: str) -> str:
 
 def _abandoned(owner: str, lease_until: float, now: float) -> bool:
     """Tell whether a claim has expired, or its process on this machine has ended."""
-    host, pid, _ = owner.rsplit("|", 2)
-    return now > lease_until or (host == socket.gethostname() and not _alive(int(pid)))
+    machine, pid, _ = owner.rsplit("|", 2)
+    return now > lease_until or (machine == _machine() and not _alive(int(pid)))
+
+
+def _machine() -> str:
+    """Return the name of this machine, and on Linux of its container: each has numbers of processes of its own."""
+    try:
+        container = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        container = ""
+    return f"{socket.gethostname()} {container}"
 
 
 def _alive(pid: int) -> bool:

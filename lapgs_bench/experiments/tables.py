@@ -28,7 +28,7 @@ def markdown(table: ResultTable) -> str:
     for group in (*table.groups, *table.scenes):
         header, *rows = _grid(group, table.experiment.table)
         lines += [f"## {group.title}", "", _markdown_line(header), _markdown_line(["---"] * len(header))]
-        lines += [_markdown_line(row if len(row) > 1 else [f"**{row[0]}**", *[""] * (len(header) - 1)]) for row in rows]
+        lines += [_markdown_line(row if len(row) > 1 else _heading(row[0], len(header))) for row in rows]
         lines += ["", *group.notes, ""] if group.notes else [""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -74,6 +74,11 @@ def _grid(group: Group, shape: Table) -> Iterator[list[str]]:
 
 def _markdown_line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _heading(section: str, columns: int) -> list[str]:
+    """Return the cells of a section's heading; rows without a section follow an empty line."""
+    return [f"**{section}**" if section else "", *[""] * (columns - 1)]
 
 
 def _ratios(row: TableRow) -> list[str]:

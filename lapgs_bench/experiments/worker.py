@@ -61,6 +61,9 @@ def work(
             continue
         except LapgsError as error:
             store.fail(claim, str(error))
+        except OSError:  # such as a full disk; the claim of a process that lives on would block the run
+            store.release(claim)
+            raise
         else:
             store.record(claim, row)
         finished += 1

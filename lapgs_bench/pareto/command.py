@@ -23,8 +23,11 @@ def draw_pareto(scene: Path, settings: ParetoSettings) -> None:
     folder = settings.out or Path("runs", "pareto", scene.absolute().name)
     require_utf8(folder, "--out")
     require_place(folder)
+    bench = Bench(settings, scene, folder, say)
+    for method in methods:
+        bench.check(method)
     try:
-        rows, failures = _measure(Bench(settings, scene, folder, say), methods)
+        rows, failures = _measure(bench, methods)
     except KeyboardInterrupt:
         raise TrainingStoppedError("stopped; repeat the command to continue with the remaining runs") from None
     if not rows:

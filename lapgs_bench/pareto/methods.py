@@ -122,4 +122,5 @@ def job_of(spec: RunSpec, scene: Path, folder: Path, evaluate: Sequence[str] | N
     checkout = None if spec.checkout is None else Path(spec.checkout)
     steps = run_steps(spec, scene.absolute(), checkout, own, evaluate)
     log = folder.absolute() / LOGS / f"{name}.log"
-    return Job(name, spec, str(own), str(log), tuple(steps), evaluate is not None, defaults_of(spec))
+    where = str(scene.absolute())
+    return Job(name, spec, str(own), str(log), tuple(steps), evaluate is not None, defaults_of(spec), where)

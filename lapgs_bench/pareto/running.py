@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lapgs_bench.experiments.execution import STORE
+from lapgs_bench.experiments.checks import check_run
+from lapgs_bench.experiments.execution import LOGS, STORE, execute
+from lapgs_bench.experiments.launchers import WorkOrder, launch
+from lapgs_bench.experiments.settings import WorkerSettings
 from lapgs_bench.experiments.store import DONE, Job, Outcome, ResultStore
-from lapgs_bench.experiments.worker import work
 from lapgs_bench.pareto.methods import Method, job_of, run_spec
 from lapgs_bench.pareto.settings import ParetoSettings
 from lapgs_plugin.errors import LapgsError
@@ -42,12 +42,23 @@ class Bench:
         scene: its folder.
         folder: where runs and results are written.
         say: receives a line for each run.
+        done: jobs whose rows were returned; those of other defaults are refused beside a run that is missing.
     """
 
     settings: ParetoSettings
     scene: Path
     folder: Path
     say: Say
+    done: list[Job] = field(default_factory=list)
+
+    def check(self, method: Method) -> None:
+        """Check the options of a method's first run before any other method is trained.
+
+        Raises:
+            LapgsError: its command, or the checkout's script, would refuse them.
+        """
+        spec = run_spec(method, self.settings, self.scene, WARM_UP, self.settings.seed_list[0])
+        check_run(job_of(spec, self.scene, self.folder, None), spec, self.scene)
 
     def rows(self, method: Method) -> list[Row]:
         """Return a row for each budget and seed of a method, after running what is missing.
@@ -74,13 +85,14 @@ class Bench:
         spec = run_spec(method, self.settings, self.scene, iterations, seed)
         job = job_of(spec, self.scene, self.folder, self._measuring if evaluated else None)
         store = ResultStore.create(self.folder / STORE)
-        store.plan([job])
+        store.plan([*self.done, job])
         (outcome,) = store.outcomes([job.run_id])
         kept = outcome.state == DONE
         if not kept:
-            outcome = _work(store, self.folder / STORE, job)
+            outcome = _finished(store, self.folder.absolute(), job)
         if outcome.record is None:
             raise MethodFailedError(f"{method.name}, {iterations} iterations: {outcome.error}")
+        self.done.append(job)
         seconds = outcome.record["train_seconds"]
         what = "" if evaluated else " to measure its rate"
         self.say(
@@ -125,15 +137,8 @@ def _length(run: Row) -> tuple[int, float]:
     return run["iterations"], run["train_seconds"]
 
 
-def _work(store: ResultStore, path: Path, job: Job) -> Outcome:
-    """Run a job in this process's worker until it has ended; it is released if this is interrupted."""
-    stop = threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(work, path, [job.run_id], stop=stop)
-        try:
-            future.result()
-        except BaseException:
-            stop.set()
-            raise
-    (outcome,) = store.outcomes([job.run_id])
+def _finished(store: ResultStore, folder: Path, job: Job) -> Outcome:
+    """Run a job until it has ended, or wait for another command that runs it; it is released if this is interrupted."""
+    order = WorkOrder(folder / STORE, [job.run_id], folder / LOGS / "workers", WorkerSettings(workers=1))
+    (outcome,) = execute(store, order.run_ids, lambda: launch(order), lambda _: None)
     return outcome

@@ -71,13 +71,22 @@ class BareRunRecorder(TimedLoop):
         Raises:
             UserInputError: the script never trained.
             RunFolderError: its output folder holds a run in levels.
+            SystemExit: the script's own.
         """
-        with Attachment(self._replacements()), self._timing:
-            self._adapter.script.run_main()
+        try:
+            with Attachment(self._replacements()), self._timing:
+                self._adapter.script.run_main()
+        except SystemExit as error:
+            if error.code in (None, 0) and self._call is not None and self.iteration:  # as of sys.exit(main())
+                self._write(self._call)
+            raise
         if self._call is None or self.iteration == 0:
             raise UserInputError(f"{self._adapter.script.path} ended without training; there is nothing to record")
-        path = Path(self._call.dataset.model_path) / BARE_RECORD
-        write_text(path, json.dumps(self._contents(self._call), indent=2) + "\n")
+        self._write(self._call)
+
+    def _write(self, call: TrainingCall) -> None:
+        path = Path(call.dataset.model_path) / BARE_RECORD
+        write_text(path, json.dumps(self._contents(call), indent=2) + "\n")
         logger.info("recorded: %s", path)
 
     def _replacements(self) -> list[Replacement]:

@@ -124,6 +124,22 @@ def test_iterations_are_steps_where_nothing_says_when_they_begin(scene: Path, tm
     assert [entry["iteration"] for entry in values["timeline"]] == list(range(1, 21))
 
 
+@pytest.mark.parametrize(("end", "is_recorded"), [("sys.exit()", True), ("sys.exit(0)", True), ("sys.exit(3)", False)])
+def test_a_script_that_exits_is_recorded_if_it_succeeded(
+    end: str, is_recorded: bool, scene: Path, tmp_path: Path
+) -> None:
+    script = tmp_path / "checkouts" / "graphdeco" / "train.py"
+    shutil.copytree(CHECKOUTS, tmp_path / "checkouts", ignore=shutil.ignore_patterns("__pycache__"))
+    ended = 'print("\\nTraining complete.")'
+    text = script.read_text(encoding="utf-8")
+    assert ended in text
+    script.write_text(text.replace(ended, f"import sys; {end}"), encoding="utf-8")
+    folder, more = tmp_path / "out", ("--iterations", 20)
+    with loaded(STUBS["graphdeco"], scene, folder, *more, script=script) as adapter, pytest.raises(SystemExit):
+        BareRunRecorder(adapter, "cpu", MeasuringOptions()).run()
+    assert (folder / BARE_RECORD).is_file() == is_recorded
+
+
 def test_import_run_takes_over_what_was_recorded(scene: Path, tmp_path: Path) -> None:
     recorded = record("graphdeco", scene, tmp_path / "recorded")
     values = json.loads((recorded.folder / BARE_RECORD).read_text())

@@ -196,6 +196,34 @@ def test_joint_training_moves_the_base(scene: Path, tmp_path: Path) -> None:
     assert 0 < changed < 10 * 2.5e-3 * 1.1  # ten steps at the script's rate, not at that of residuals
 
 
+def test_rates_that_are_numbers_in_a_script(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs made from older examples have no settings of learning rates; their residuals are trained alike."""
+    residuals = hierarchy("laplacian", "--residual-color-rate", 3)
+    usual = RunArchive.open(train(scene, tmp_path / "usual", lapgs=residuals))
+    settings = "    sh0_lr: float = 2.5e-3\n    shN_lr: float = 2.5e-3 / 20\n"
+    script = edited(tmp_path / "checkout", settings, "")
+    script.write_text(script.read_text().replace("config.sh0_lr", "2.5e-3").replace("config.shN_lr", "2.5e-3 / 20"))
+    monkeypatch.setattr(f"{__name__}.SCRIPT", script)
+    fixed = RunArchive.open(train(scene, tmp_path / "fixed", lapgs=residuals))
+    for level in (1, 0):
+        assert torch.equal(usual.field(level).sh, fixed.field(level).sh)
+
+
+def test_a_loader_that_is_imported_by_name(
+    finished: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = edited(tmp_path / "checkout", "torch.utils.data.DataLoader(", "DataLoader(")
+    script.write_text(
+        script.read_text().replace("import torch\n", "import torch\nfrom torch.utils.data import DataLoader\n", 1)
+    )
+    monkeypatch.setattr(f"{__name__}.SCRIPT", script)
+    usual, own = (
+        RunArchive.open(each) for each in (finished, train(scene, tmp_path / "run", lapgs=hierarchy(finished.name)))
+    )
+    for level in (1, 0):
+        assert torch.equal(usual.field(level).means, own.field(level).means)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_mcmc_in_batches(kind: str, scene: Path, tmp_path: Path) -> None:
     folder = train(scene, tmp_path / "run", "--batch_size", 2, lapgs=hierarchy(kind), kind="mcmc")

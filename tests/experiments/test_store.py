@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -21,6 +22,7 @@ from lapgs_bench.experiments.store import DONE, FAILED, LEASE, MAX_CLAIMS, PENDI
 from lapgs_bench.experiments.worker import work
 from lapgs_plugin.errors import RunFolderError
 from tests.experiments.examples import COPY, START, copying_jobs, starts
+from tests.mishaps import disk_full
 from tests.waiting import wait_for
 
 WORKER = "import sys; from pathlib import Path; from lapgs_bench.experiments.worker import work; "
@@ -117,6 +119,27 @@ def test_a_worker_that_slept_through_its_lease_records_nothing(
     assert (outcome.state, outcome.record) == (DONE, {"psnr": 2.0})
 
 
+def test_a_worker_in_another_container_is_not_taken_for_dead(
+    planned: tuple[ResultStore, list[str]], tmp_path: Path
+) -> None:
+    """Containers on the host's network have its name, but numbers of processes of their own."""
+    apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child"]
+    if (
+        sys.platform != "linux"
+        or shutil.which("unshare") is None
+        or subprocess.run([*apart, "true"], check=False).returncode
+    ):
+        pytest.skip("this machine lets nobody number processes anew")
+    store, run_ids = planned
+    claim = store.claim(run_ids[:1])
+    assert claim is not None
+    code = "import sys; from pathlib import Path; from lapgs_bench.experiments.store import ResultStore; "
+    code += "print(ResultStore(Path(sys.argv[1])).has_free(sys.argv[2:]))"
+    command = [*apart, sys.executable, "-c", code, str(tmp_path / "results.sqlite"), run_ids[0]]
+    assert subprocess.check_output(command, text=True) == "False\n"
+    assert store.renew(claim)
+
+
 def test_a_run_that_kills_its_workers_fails_in_the_end(
     planned: tuple[ResultStore, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +188,27 @@ def test_a_command_that_writes_no_run_is_a_failure(tmp_path: Path) -> None:
     (outcome,) = worked(tmp_path, jobs)
     assert outcome.state == FAILED
     assert "is not a run" in outcome.error
+
+
+def test_a_worker_without_room_gives_its_run_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process lives on, as that of `lapgs bench` does, so nobody would take the run before its claim expires."""
+    jobs = copying_jobs(tmp_path, 1)
+    path, run_ids = tmp_path / "results.sqlite", [jobs[0].run_id]
+    store = ResultStore.create(path)
+    store.plan(jobs)
+
+    def fail(*_: object, **__: object) -> None:
+        raise disk_full()
+
+    with monkeypatch.context() as full:
+        full.setattr(Path, "mkdir", fail)
+        with pytest.raises(OSError, match="No space left"):
+            work(path, run_ids)
+    assert store.has_free(run_ids)
+    assert work(path, run_ids) == 1
+    (outcome,) = store.outcomes(run_ids)
+    assert outcome.record is not None
+    assert outcome.record["attempt"] == 1, "nothing died"
 
 
 def test_stopping_kills_the_run_and_gives_it_back(tmp_path: Path) -> None:

@@ -140,6 +140,13 @@ def test_markdown() -> None:
     assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
 
 
+def test_rows_after_a_section_may_have_none() -> None:
+    variants = [{"name": "one", "section": "Alone"}, {"name": "two", "options": {"levels": 2}}]
+    text = markdown(table_of(paper_experiment(variants=variants, table={"columns": ["minutes"]})))
+    rows = [line for line in text.splitlines() if line.startswith("|")][2:]
+    assert [row.split("|")[1].strip() for row in rows] == ["**Alone**", "one", "", "two"]
+
+
 def test_latex() -> None:
     text = latex(
         table_of(paper_experiment(table={"paper": "main_1k", "columns": ["minutes", "psnr"], "by_scene": True}))

@@ -38,6 +38,10 @@ STUB = STUBS["graphdeco"].script.parent
         ("--checkout-options x", "--checkout-options 'x': there is no --checkout"),
         ("--checkout stub --checkout-options a --checkout-options b", "given 2 times for 1 checkouts"),
         ("--checkout stub --checkout-options --iterations=5", "--checkout-options --iterations=5: scene, folder and"),
+        ("--checkout stub --resolution 9/10", "resolution '9/10' for scene scene: the script of a checkout takes 1k"),
+        ("--rasterizer cuda", "--rasterizer cuda: expected"),
+        ("--checkout stub --device gpu", "--device gpu: expected"),
+        ("--seeds=-1", "--seed -1: expected"),
         ("--checkout stub --checkout stub", "two folders make the method 'stub, own script'"),
     ],
 )

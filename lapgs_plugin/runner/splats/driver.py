@@ -6,7 +6,8 @@ replaced, and restored by identity at the end:
 
     `train` of the class                                as above
     `rasterization`, as the script imports it           our kernels, signed colours, coarser levels in the image
-    `torch.utils.data.DataLoader`, of its datasets      batches of the level's images, which are in memory
+    `torch.utils.data.DataLoader`, also where the
+    script imports it, of its datasets                  batches of the level's images, which are in memory
     `__init__` of the class, `Parser`                   read a scene once
     `eval` and the like of the class                    do not count as training
     `cli`, as the script imports it                     stays in this process, on one GPU
@@ -36,6 +37,7 @@ from lapgs_plugin.errors import DeviceMemoryError, UserInputError, first_line
 from lapgs_plugin.fields.gaussian_field import GaussianField, splats_from_field
 from lapgs_plugin.hierarchy.inheritance import inherit
 from lapgs_plugin.hierarchy.plan import Stage
+from lapgs_plugin.runner.splats.joint import COLORS
 from lapgs_plugin.runner.splats.run import SplatRequest, SplatRun, prepare
 from lapgs_plugin.runner.splats.schedule import set_threshold, stage_config
 from lapgs_plugin.runner.splats.signed import FinishedField, Rasterizer
@@ -113,6 +115,8 @@ class SplatDriver:
             Replacement(self._module, RASTERIZATION, lambda _: self._rasterize, trainer),
             Replacement(data, "DataLoader", self._loading, trainer),
         ]
+        imported = [name for name, value in of_script.items() if value is data.DataLoader]
+        replacements += [Replacement(self._module, name, self._loading, trainer) for name in imported]
         replacements += [Replacement(self._class, n, self._measuring, trainer) for n in MEASUREMENTS if n in of_class]
         if isinstance(of_script.get("Parser"), type):
             replacements.append(
@@ -279,6 +283,10 @@ class SplatDriver:
         for name, module in _beside_splats(trainer).items():
             if name in learned and _shapes(learned[name]) == _shapes(module.state_dict()):
                 module.load_state_dict(learned[name])
+        if stage.signed:
+            # Its optimizers, not its settings: programs made of older examples have rates as numbers in their code.
+            for name in COLORS:
+                _scale_rate(trainer.optimizers[name], run.window(stage).residual_color_rate)
         self._scale_sh_rate()
 
     def _inherit(self, coarser: GaussianField) -> None:
@@ -294,8 +302,13 @@ class SplatDriver:
         rate, optimizers = self._run.settings.sh_rate, self._run.trainer.optimizers
         if rate != 1.0 and "shN" not in optimizers:
             raise UserInputError(f"--sh-rate {rate:g}: the script has no optimizer of shN; leave it out")
-        for group in optimizers["shN"].param_groups if rate != 1.0 else ():
-            group["lr"] *= rate
+        if rate != 1.0:
+            _scale_rate(optimizers["shN"], rate)
+
+
+def _scale_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] *= factor
 
 
 def _beside_splats(trainer: Any) -> dict[str, torch.nn.Module]:

@@ -15,7 +15,7 @@ NEVER = 10**9
 
 
 def stage_config(config: Any, window: StageWindow, result_dir: str, settings: HierarchySettings) -> Any:
-    """Return a script's settings for one stage: schedule scaled to its length, its own output folder, its rates.
+    """Return a script's settings for one stage: schedule scaled to its length, its own output folder.
 
     Args:
         config: settings of the whole run.
@@ -33,11 +33,8 @@ def stage_config(config: Any, window: StageWindow, result_dir: str, settings: Hi
         if name.endswith("_stop_iter") and value > 0:
             setattr(own.strategy, name, window.scaled(value))
     set_threshold(own.strategy, config.strategy, window.threshold_factor)
-    if stage.signed:
-        if hasattr(own.strategy, "reset_every") and not settings.residual_resets:
-            own.strategy.reset_every = NEVER
-        for name in ("sh0_lr", "shN_lr"):
-            setattr(own, name, getattr(own, name) * window.residual_color_rate)
+    if stage.signed and hasattr(own.strategy, "reset_every") and not settings.residual_resets:
+        own.strategy.reset_every = NEVER
     return own
 
 
