@@ -217,7 +217,10 @@ def require_manifest(folder: Path) -> None:
         is_run = (folder / MANIFEST).is_file()
     if not is_run:
         state = f"has no {MANIFEST}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
-        raise RunFolderError(f"{folder} {state}, so it is not a run; expected a folder written by `lapgs train -o`")
+        raise RunFolderError(
+            f"{folder} {state}, so it is not a run; expected a folder of `lapgs train` or "
+            "`lapgs run`; of a model that was trained without them `lapgs import-run` makes one"
+        )
 
 
 def lock(descriptor: int, patience: float = 0.0) -> bool | None:

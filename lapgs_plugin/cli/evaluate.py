@@ -126,7 +126,7 @@ def _stability(run: Path, trajectory: str, settings: EvaluateSettings, options: 
 def _print(metrics: dict[str, Any]) -> None:
     console = make_console()
     print_views(console, metrics)
-    _print_levels(console, metrics)
+    print_levels(console, metrics)
     if metrics["breakdown_seconds"]:
         _print_breakdown(console, metrics)
     _print_summary(console, metrics)
@@ -159,7 +159,7 @@ def print_views(console: Console, metrics: dict[str, Any]) -> None:
         )
 
 
-def _print_levels(console: Console, metrics: dict[str, Any]) -> None:
+def print_levels(console: Console, metrics: dict[str, Any]) -> None:
     table = make_table("level", "size", "iterations", "seconds", "Gaussians", "peak", "PSNR", "upsampled")
     for level, figures in metrics["levels"].items():
         width, height = figures["image_size"]

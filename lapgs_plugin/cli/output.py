@@ -57,7 +57,7 @@ def make_table(*headings: str) -> Table:
     from rich import box
     from rich.table import Table
 
-    return Table(*headings, box=box.SIMPLE_HEAD)
+    return Table(*headings, box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
 
 
 def show_log() -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,9 @@ OF_OFF = {
     *("backbone", "device", "rasterizer", "verbose", "seed"),
 }
 """Parameters that `--off` can be combined with."""
+
+USAGE = 2
+"""Exit code of argparse for a command line that it refuses."""
 
 CONTEXT = {"allow_interspersed_args": False}
 """Options after the script are passed to the script."""
@@ -144,10 +147,36 @@ def run(
     logging.getLogger("lapgs_plugin.rasterizers.choice").setLevel(logging.WARNING)  # of the preview
     attachment = logging.getLogger("lapgs_plugin.checkouts.attachment")
     attachment.setLevel(logging.INFO if options.verbose else logging.WARNING)
-    if splats is not None:
-        _execute_splats(splats, words, device, options, settings, measuring, watcher)
-        return
-    _execute(path, words, kind, device, options, settings, measuring, watcher)
+    if options.device == "auto" and device == "cpu":
+        logging.getLogger(__name__).info(
+            "no CUDA device: the script runs on the CPU, with our modules in place of its CUDA extensions; this is slow"
+        )
+    with _misplaced_options_named(context, script, words):
+        if splats is not None:
+            _execute_splats(splats, words, device, options, settings, measuring, watcher)
+        else:
+            _execute(path, words, kind, device, options, settings, measuring, watcher)
+
+
+@contextmanager
+def _misplaced_options_named(context: typer.Context, script: Path, words: Sequence[str]) -> Iterator[None]:
+    """Name options of ours that were given after the script, if the script refuses its command line.
+
+    A script may have options of the same names, so its own message comes first.
+
+    Raises:
+        UserInputError: the script ended as argparse does, and got at least one of our options.
+    """
+    try:
+        yield
+    except SystemExit as end:
+        ours = {name for parameter in context.command.params for name in parameter.opts if name.startswith("--")}
+        given = dict.fromkeys(word.partition("=")[0] for word in words)
+        if end.code != USAGE or not (found := [name for name in given if name in ours]):
+            raise
+        raise UserInputError(
+            f"{found[0]} is an option of `lapgs run`: if it is meant, give it before {script}"
+        ) from end
 
 
 def _execute_splats(

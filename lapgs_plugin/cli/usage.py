@@ -58,4 +58,6 @@ def one_line_usage_errors(context: Any = None) -> Iterator[None]:
         said = usage_message(error)
         if (name := str(getattr(error, "option_name", "")).lstrip("-")) in REPLACED:
             raise UserInputError(f"no such option: --{name}; give {REPLACED[name]}") from error
+        if command == "lapgs run" and said.startswith("no such option"):
+            raise UserInputError(f"{said}; options of the script go after it, see `{command} --help`") from error
         raise UserInputError(f"{said}{' See' if said.endswith('?') else '; see'} `{command} --help`") from error

@@ -30,7 +30,7 @@ from typing import Any
 from torch import Tensor
 
 from lapgs_plugin.environment import versions
-from lapgs_plugin.errors import RunFolderError
+from lapgs_plugin.errors import RunFolderError, counted
 from lapgs_plugin.evaluation.lpips import LPIPS_KEY, LpipsMetrics, LpipsRequest, lpips_metrics
 from lapgs_plugin.evaluation.metrics import color_fitted_psnr, means, psnr, ssim
 from lapgs_plugin.hierarchy.masks import fill_outside, masked_gaussian
@@ -260,8 +260,12 @@ def require_complete(archive: RunArchive) -> None:
         RunFolderError: a level is not finished.
     """
     manifest = archive.manifest
-    if not manifest.complete:
-        raise RunFolderError(
-            f"{archive.path()}: only {len(manifest.records)} of {manifest.levels} levels are trained; finish the run "
-            "with its own command and --resume, or look at what is there with `lapgs render`"
-        )
+    if manifest.complete:
+        return
+    finish = "finish the run with its own command and --resume"
+    if not manifest.records:
+        raise RunFolderError(f"{archive.path()}: none of {counted(manifest.levels, 'level')} is trained; {finish}")
+    raise RunFolderError(
+        f"{archive.path()}: only {len(manifest.records)} of {manifest.levels} levels are trained; {finish}, or look at "
+        "what is there with `lapgs render`"
+    )

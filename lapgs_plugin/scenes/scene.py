@@ -20,7 +20,7 @@ from torch import Tensor
 from lapgs_plugin.errors import SceneError, UserInputError, counted
 from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.units import unit_of_depth
-from lapgs_plugin.files import is_file, is_folder
+from lapgs_plugin.files import MANIFEST, is_file, is_folder
 from lapgs_plugin.hierarchy.inheritance import NEIGHBOURS, places_of
 from lapgs_plugin.limits import VIEW_PIXELS
 from lapgs_plugin.scenes.blender import SINGLE_FILE, TRAIN_FILE, count_frames, has_transforms, read_transforms
@@ -426,6 +426,8 @@ def _checked_source(path: Path, images: str, evaluate: bool, distorted: bool) ->
         source = read_transforms(path, images, evaluate, distorted=distorted)
     elif (export := find_export(path)) is not None:
         source = read_export(export, path, images, evaluate, distorted)
+    elif is_file(path / MANIFEST):
+        raise SceneError(f"{path} is a run, expected a scene; its {MANIFEST} names the scene that it was trained on")
     else:
         raise SceneError(
             f"{path}: neither a COLMAP model (sparse/0/cameras.bin) nor transforms.json, nor an export of another "

@@ -74,6 +74,10 @@ def test_one_line_and_nothing_written(
             "train s -o r --exposure on",
             "lapgs: no such option: --exposure; give --appearance (none, affine or bilateral; before: off, on)",
         ),
+        (
+            "run --iterations 60 train.py -s scene",
+            "lapgs: no such option: --iterations; options of the script go after it, see `lapgs run --help`",
+        ),
         ("patch nothing", "lapgs: no such command 'nothing'; see `lapgs patch --help`"),
     ],
 )

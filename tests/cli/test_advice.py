@@ -115,7 +115,7 @@ ADVICE = [
         "finish the run with its own command and --resume, or look .* `lapgs render`",
         ["train {scene} -o {half} --resume", "render {half} --level 1"],
     ),
-    ("eval {tmp}/none", "expected a folder written by `lapgs train -o`", [TRAIN]),
+    ("eval {tmp}/none", "expected a folder of `lapgs train` or `lapgs run`", [TRAIN]),
     ("report {run} {all_trained}", "lapgs report RUN --baseline OTHER", ["report {run} --baseline {all_trained}"]),
     ("report {odd_metrics}", "write it again with `lapgs eval`", ["eval {odd_metrics}", "report {odd_metrics}"]),
     ("report {odd_history}", "delete that line", ["cut {odd_history}/history.jsonl", "report {odd_history}"]),

@@ -81,12 +81,13 @@ def test_prepare_proposes_a_training_that_this_machine_can_do(
     [
         ("train desk -o runs/desk", "desk: no such scene folder; "),
         ("train empty -o runs/desk", "empty: neither a COLMAP model "),
+        ("train run -o runs/desk", "run is a run, expected a scene; "),
         ("train desk -o full", "full is not empty and not a run "),
         ("train desk -o full/train.py/x", "--out full/train.py/x: full/train.py is a file; "),
         ("train desk -o /proc/run", "--out /proc/run"),
         ("run --device cpu full/train.py", "full/train.py is not the training script "),
         ("eval runs/desk", "runs/desk does not exist, "),
-        ("render empty", "empty has no manifest.json, "),
+        ("render empty", "empty has no manifest.json, .* `lapgs run`; .* `lapgs import-run` "),
         ("view empty", "empty has no manifest.json, "),
     ],
 )
@@ -94,8 +95,9 @@ def test_messages_name_folders_as_they_were_typed(
     words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for folder in ("empty", "full"):
+    for folder in ("empty", "full", "run"):
         Path(folder).mkdir()
+    Path("run/manifest.json").write_text("{}")
     Path("full/train.py").write_text("import json\n")
     refuses(UserInputError, f"^{message}", succeeding(app, 120), *words.split())
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
+from io import StringIO
 from itertools import count
 from pathlib import Path
 
@@ -13,11 +15,13 @@ import numpy as np
 import pytest
 import torch
 import typer
+from rich.console import Console
 from typer.testing import CliRunner
 
-from lapgs_plugin.cli.evaluate import evaluate
+from lapgs_plugin.cli.evaluate import evaluate, print_levels
 from lapgs_plugin.cli.render import render
 from lapgs_plugin.errors import RunFolderError, SceneError, UserInputError
+from lapgs_plugin.evaluation.figures import evaluate_run
 from lapgs_plugin.evaluation.lpips import NETWORKS
 from lapgs_plugin.hierarchy.pyramid import Pyramid
 from lapgs_plugin.rendering.images import caption_height, file_stems
@@ -95,6 +99,18 @@ def test_render_options(run: Path, tmp_path: Path) -> None:
     assert not (run / "renders").exists()
 
 
+def test_tables_fit_into_80_columns(scene: Path, tmp_path: Path) -> None:
+    metrics = evaluate_run(RunArchive.open(write_run(tmp_path / "run", scene)))
+    for figures in metrics["levels"].values():  # of a large run
+        figures.update(image_size=[4946, 3286], iterations=30000, train_seconds=1234.5)
+        figures.update(num_gaussians=1_000_000, peak_gaussians=1_500_000)
+    stream = StringIO()
+    print_levels(Console(file=stream, width=80), metrics)
+    text = stream.getvalue()
+    assert "…" not in text
+    assert re.search("level +size +iterations +seconds +Gaussians +peak +PSNR +upsampled", text)
+
+
 def test_one_level_has_one_image_a_view(scene: Path, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", scene, levels=1, hold_out=False)
     lapgs("render", run)
@@ -109,6 +125,9 @@ def test_an_interrupted_run_renders_what_is_there_and_is_not_measured(scene: Pat
     refuses(RunFolderError, "only 1 of 2 levels are trained", lapgs, "eval", run)
     empty = write_run(tmp_path / "empty", scene, finished=0)
     refuses(RunFolderError, "level 1 is not in this run", lapgs, "render", empty)
+    # What is advised has to work: there is nothing to render yet.
+    assert "`lapgs render`" in refuses(RunFolderError, "only 1 of 2 levels", lapgs, "eval", run)
+    assert "`lapgs render`" not in refuses(RunFolderError, "none of 2 levels is trained", lapgs, "eval", empty)
 
 
 def test_view_names_that_would_share_a_file_keep_their_extension(tmp_path: Path) -> None:

@@ -570,6 +570,24 @@ def test_the_scripts_own_mistakes_are_its_own(lapgs_run: Any, tmp_path: Path) ->
     assert lines[-1] == "AssertionError: Could not recognize scene type!", "with its traceback"
 
 
+@pytest.mark.parametrize("word", ["--hierarchy", "--hierarchy=nested"])
+def test_our_option_after_the_script_is_told_its_place(word: str, lapgs_run: Any, scene: Path, tmp_path: Path) -> None:
+    script = STUBS["taming"].script
+    code, lines = lapgs_run("--device", "cpu", script, "-s", scene, "-m", tmp_path / "run", word)
+    assert code == 2
+    assert "unrecognized arguments: --hierarchy" in lines[-2], "argparse's own words"
+    assert lines[-1] == f"lapgs: --hierarchy is an option of `lapgs run`: if it is meant, give it before {script}"
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_cpu_that_nobody_asked_for_is_said(lapgs_run: Any, caplog: pytest.LogCaptureFixture) -> None:
+    lapgs_run("--device", "cpu", STUBS["taming"].script, "--no_such_option")
+    assert "no CUDA device" not in caplog.text
+    lapgs_run(STUBS["taming"].script, "--no_such_option")
+    assert "no CUDA device: the script runs on the CPU" in caplog.text
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 def test_cuda_that_is_not_there(lapgs_run: Any, scene: Path) -> None:
     code, lines = lapgs_run("--device", "cuda", STUBS["taming"].script, "-s", scene)

@@ -153,7 +153,7 @@ def test_bad_requests_are_one_line(run: Path, trained: Path, scene: Path, tmp_pa
     assert "--launcher-option x: the local launcher has none" in refused(run, "--launcher-option", "x=1")
     assert "--rasterizer none: expected auto, " in refused(run, "--rasterizer", "none")
     assert "--launcher-option gpus: expected NAME=VALUE" in refused(run, "--launcher-option", "gpus")
-    assert "expected a folder written by `lapgs train -o`" in refused(tmp_path / "none")
+    assert "expected a folder of `lapgs train` or `lapgs run`" in refused(tmp_path / "none")
     assert f"--scene: {tmp_path / 'gone'}" in refused(run, "--scene", tmp_path / "gone")
     assert "is a tile of another run" in refused(trained / "tile_0_0")
     half = shutil.copytree(run, tmp_path / "half")

@@ -262,7 +262,7 @@ def test_refinement_is_refused_where_it_is_not_offered(tmp_path: Path) -> None:
         TrainSettings(refine_poses=True, protocol="paper")
     error = CliRunner().invoke(app, ["run", "--refine-poses", "train.py", "-s", "scene"]).exception
     assert isinstance(error, UserInputError)
-    assert str(error) == "no such option: --refine-poses; see `lapgs run --help`"
+    assert str(error) == "no such option: --refine-poses; options of the script go after it, see `lapgs run --help`"
 
 
 def without_common_part(scene: Scene, start: Poses) -> Poses:
