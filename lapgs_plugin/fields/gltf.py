@@ -81,7 +81,7 @@ def _attributes(field: GaussianField) -> dict[str, NDArray[Any]]:
     tensors = {
         "POSITION": field.means,
         f"{EXTENSION}:ROTATION": torch.stack([x, y, z, w], dim=1),
-        f"{EXTENSION}:SCALE": field.log_scales.exp(),
+        f"{EXTENSION}:SCALE": field.log_scales.exp().clamp_max(torch.finfo(torch.float32).max),
         f"{EXTENSION}:OPACITY": opacities,
     }
     for degree in range(field.sh_degree + 1):

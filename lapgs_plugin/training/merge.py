@@ -75,7 +75,7 @@ def merge_levels(
         monitor: shows progress.
 
     Raises:
-        UserInputError: the run has no residuals, and needs no merging.
+        UserInputError: the run has no residuals, and needs no merging, or its base has no Gaussians.
         RunFolderError, SceneError: a field or the scene cannot be read.
         TrainingStoppedError: the user asked to stop.
     """
@@ -84,6 +84,11 @@ def merge_levels(
     if not fields[0].signed:
         raise UserInputError(
             f"{archive.path()}: level 0 is an ordinary field already, which needs no --merge; leave it out"
+        )
+    if len(fields[max(fields)]) == 0:
+        raise UserInputError(
+            f"{archive.path()}: level {max(fields)} has no Gaussians, expected some for --merge to start from; train "
+            "the run again"
         )
     with one_pool(), tempfile.TemporaryDirectory(prefix="lapgs-merge-") as scratch:
         renderer, scene = run_renderer(archive), run_scene(archive, moved_to)

@@ -83,6 +83,8 @@ class InitialView:
     def of_field(cls, field: GaussianField) -> InitialView:
         """Begin in front of a field with unknown cameras, with the up direction of COLMAP's images."""
         means = field.means.detach().cpu().double().numpy()
+        if len(means) == 0:
+            means = np.zeros((1, 3))
         centre = np.median(means, axis=0)
         radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.8)) or 1.0  # all at one place
         position = centre - np.array([0.0, 0.0, 2.5 * radius])

@@ -23,7 +23,7 @@ from lapgs_plugin.rendering.run import run_cameras, run_renderer, run_scene
 from lapgs_plugin.runs.archive import RunArchive
 from lapgs_plugin.runs.layout import EXPOSURE
 from lapgs_plugin.training import merge, stage_start, trainer
-from lapgs_plugin.training.merge import FAINT, first_field
+from lapgs_plugin.training.merge import FAINT, first_field, merge_levels
 from lapgs_plugin.training.prepared_run import PreparedRun
 from tests.cli.run_folder import BACKGROUND, write_run, write_scene
 from tests.cli.test_export import lapgs_export
@@ -144,3 +144,8 @@ def test_runs_that_cannot_be_merged_are_one_line(tmp_path: Path) -> None:
     assert not (nested / "export").exists()
     with pytest.raises(RunFolderError, match="level 0 is not in this run"):
         lapgs_export(write_run(tmp_path / "half", scene, finished=1), "--merge")
+    archive = RunArchive.open(write_run(tmp_path / "empty", scene))
+    fields = {1: archive.field(1).kept(torch.zeros(250, dtype=torch.bool)), 0: archive.field(0)}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(RunArchive, "field", lambda self, level: fields[level])
+        refuses(UserInputError, "level 1 has no Gaussians, expected some for --merge", merge_levels, archive)

@@ -117,6 +117,14 @@ def test_the_picture_is_the_same(tmp_path: Path) -> None:
     assert float((before - after).abs().max()) < 5e-6  # 3.6e-7 seen
 
 
+def test_enormous_scales_are_the_largest_numbers(tmp_path: Path) -> None:
+    field = replace(blob_field(count=2), log_scales=torch.tensor([[0.0, 100.0, 88.0], [-200.0, 0.0, 1.0]]))
+    save_glb(field, tmp_path / "field.glb", "")
+    scales = attributes(tmp_path / "field.glb")[f"{PREFIX}SCALE"]
+    expected = np.exp(field.log_scales.double().numpy()).clip(max=np.finfo(np.float32).max)
+    np.testing.assert_allclose(np.sort(scales), np.sort(expected), rtol=1e-5, atol=1e-40)
+
+
 def test_what_cannot_be_held_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     none = blob_field(count=3).kept(torch.zeros(3, dtype=torch.bool))
     refuses(FieldError, "no Gaussians, expected one at least", save_glb, none, tmp_path / "none.glb", "")

@@ -185,3 +185,5 @@ def test_a_view_of_a_field_whose_cameras_are_unknown() -> None:
         )
         assert (x, y) == pytest.approx((0.0, 0.0), abs=1e-5)  # worst seen: 5e-7
         assert z > 0
+    empty = InitialView.of_field(field.kept(torch.zeros(5, dtype=torch.bool)))
+    np.testing.assert_array_equal(empty.look_at, np.zeros(3))
