@@ -5,7 +5,7 @@ Gradients are those of the CUDA code; DEPARTURE marks where these are not the de
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,9 +34,7 @@ from lapgs_plugin.reference_raster.layout import (
     VANISHING,
 )
 from lapgs_plugin.reference_raster.oracle import projection_jacobians, rotation_matrices
-
-if TYPE_CHECKING:  # it has kernels
-    from lapgs_plugin.reference_raster.pipeline import Kept, View
+from lapgs_plugin.reference_raster.pipeline import Kept, View
 
 
 def matrices(covariances: Tensor) -> Tensor:

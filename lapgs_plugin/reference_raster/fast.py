@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +16,9 @@ from lapgs_plugin.fields.camera import Camera
 from lapgs_plugin.fields.gaussian_field import GaussianField
 from lapgs_plugin.fields.rasterizer import Rasterizer, RenderResult, degree_to_evaluate, require_color
 from lapgs_plugin.jit.buffers import empty
-
-# What has kernels is imported where it is called: commands that render on a GPU do without Numba.
-if TYPE_CHECKING:
-    from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
+from lapgs_plugin.reference_raster import pipeline
+from lapgs_plugin.reference_raster.pipeline import Gaussians, Rendering, View
+from lapgs_plugin.reference_raster.rays import render_along_rays
 
 
 class CpuRasterizer(Rasterizer):
@@ -59,8 +58,6 @@ class CpuRasterizer(Rasterizer):
         degree = degree_to_evaluate(field, sh_degree)
         _check(field, background)
         if self._rays:
-            from lapgs_plugin.reference_raster.rays import render_along_rays
-
             return render_along_rays(field, camera, background, degree)
         kind = field.means.dtype
         view = _view(camera, kind)
@@ -87,8 +84,6 @@ class CpuRasterizer(Rasterizer):
         """
         if self._rays:
             return super().render_images(field, cameras, background=background)
-        from lapgs_plugin.reference_raster import pipeline
-
         _check(field, background)
         kind = field.means.dtype
         gaussians = _gaussians(list(field.parameters.values()), field.signed, field.sh_degree)
@@ -121,8 +116,6 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any, call: _Call, background: Tensor, means2d: Tensor, *parameters: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        from lapgs_plugin.reference_raster import pipeline
-
         color = background.detach().contiguous().numpy()
         gaussians = _gaussians(parameters, call.signed, call.sh_degree)
         rendering = pipeline.render(gaussians, call.view, color, keep=call.keep)
@@ -140,8 +133,6 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *from_above: Tensor | None) -> tuple[Tensor | None, ...]:
-        from lapgs_plugin.reference_raster import pipeline
-
         call: _Call = ctx.call
         rendering: Rendering = ctx.rendering
         grad_image, grad_transmittance = (None if g is None else g.contiguous().numpy() for g in from_above[:2])
@@ -166,16 +157,12 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _view(camera: Camera, kind: torch.dtype) -> View:
-    from lapgs_plugin.reference_raster import pipeline
-
     pose = camera.world_to_camera.detach().to("cpu", kind).numpy()
     return pipeline.make_view(camera.width, camera.height, pose, (camera.fx, camera.fy), (camera.cx, camera.cy))
 
 
 def _gaussians(parameters: Sequence[Tensor], signed: bool, sh_degree: int) -> Gaussians:
     """Return a field's parameters, in its order, as arrays."""
-    from lapgs_plugin.reference_raster.pipeline import Gaussians
-
     means, quats, log_scales, logits, sh = (p.detach().contiguous().numpy() for p in parameters)
     return Gaussians(means, quats, log_scales, logits, sh, None, True, signed, sh_degree)
 

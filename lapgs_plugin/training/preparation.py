@@ -68,7 +68,8 @@ class TrainRequest:
             unfinished one that gets a time ends with it.
         overwrite: replace the run in `out`.
         chosen: options that the user chose, by parameter name. A run that is continued must have been started with the
-            same. A new run on few photos gets fewer iterations if they are not among them.
+            same. A new run on few photos gets fewer iterations if they are not among them, and one for a time or on
+            large photos the strategy that auto means there.
         began: when the seconds of --time began, by `time.monotonic`.
         ranks: the processes that train it; all make the same request.
         shard: divide the Gaussians over them.
@@ -84,7 +85,7 @@ class TrainRequest:
     control: TrainingControl = field(default_factory=TrainingControl)
     resume: bool = False
     overwrite: bool = False
-    chosen: frozenset[str] = frozenset({"iterations"})
+    chosen: frozenset[str] = frozenset({"iterations", "strategy"})
     began: float = field(default_factory=time.monotonic)
     ranks: Ranks = ALONE
     shard: bool = False

@@ -238,3 +238,16 @@ def test_the_rasterizer_of_a_run_is_made_once(folder: Path, tmp_path: Path, monk
     request = TrainRequest(folder, tmp_path / "run", SHORT, control=TrainingControl(rasterizer="cpu", threads=1))
     trained(request)
     assert rasterizers == ["cpu"]
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, "3dgs"), ({"iterations"}, "mcmc")])
+def test_a_strategy_that_a_caller_asked_for_stays_on_large_photos(
+    chosen: set[str] | None, expected: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As tiles do, whose settings are those of their base."""
+    monkeypatch.setattr("lapgs_plugin.hierarchy.settings.LARGE_IMAGE", 1)
+    monkeypatch.setattr("lapgs_plugin.training.settings.LONG_RUN_OF_LARGE", SHORT.iterations)
+    asked = {} if chosen is None else {"chosen": frozenset(chosen)}
+    assert SHORT.densification.strategy == "3dgs"
+    with prepare(TrainRequest(folder, tmp_path / "run", SHORT, **asked)) as run:  # type: ignore[arg-type]
+        assert run.settings.densification.strategy == expected
