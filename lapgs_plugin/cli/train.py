@@ -125,9 +125,6 @@ class StartOptions:
             UserInputError: the machine has not as many GPUs, the scene or the settings are for fewer ranks, or torchrun
                 started another number of them.
         """
-        from lapgs_plugin.training.preparation import require_startable
-        from lapgs_plugin.training.ranks.group import AskedRanks
-
         asked, option = self.gpus or self.processes, "--processes" if self.gpus is None else "--gpus"
         if self.gpus is not None:
             launcher.require_gpus(self.gpus, rasterizer)
@@ -136,6 +133,9 @@ class StartOptions:
             return False
         if asked is None or asked == 1:
             return False
+        from lapgs_plugin.training.preparation import require_startable
+        from lapgs_plugin.training.ranks.group import AskedRanks
+
         require_startable(AskedRanks(option, asked), scene, settings, self.shard)
         launcher.launch(asked, self.gpus is not None, sys.argv[1:])
         return True

@@ -3,6 +3,8 @@
 `render` runs projection_kernels.project, then ordering_kernels, then tile_kernels.blend. `gradients` runs
 tile_kernels.blend_backward, then projection_kernels.project_backward. Gaussians have raw or activated parameters, and
 SH coefficients or colours.
+
+Kernels are imported where they are called, so that commands that render on a GPU do without Numba.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ from numpy.typing import NDArray
 from lapgs_plugin.jit.buffers import empty
 from lapgs_plugin.jit.lanes import WIDTH, Floats
 from lapgs_plugin.jit.threads import num_threads, parallel
-from lapgs_plugin.reference_raster import ordering_kernels, projection_kernels, tile_kernels
 from lapgs_plugin.reference_raster.layout import JACOBIAN_LIMIT, PIXEL_VARIANCE, SLOT, SPLAT, TILE
 
 
@@ -139,6 +140,8 @@ def render(
         assign: from the splats and the radii, which it may change, to the tiles' lists. None takes the tiles of the
             three-sigma rectangle, as all rasterizers but FastGS do.
     """
+    from lapgs_plugin.reference_raster import projection_kernels, tile_kernels
+
     n, kind = len(gaussians.means), gaussians.means.dtype
     padded = -(-n // WIDTH) * WIDTH
     tiles_x, tiles_y = view.tiles
@@ -179,6 +182,8 @@ def gradients(
 
     Its derivatives are (3, height, width) by the image, and (height, width) by the transmittance or None for zero.
     """
+    from lapgs_plugin.reference_raster import projection_kernels, tile_kernels
+
     kept = rendering.kept
     assert kept is not None, "rendered without keep=True"
     n, kind = len(gaussians.means), gaussians.means.dtype
@@ -247,6 +252,8 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Float
 
 def list_tiles(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, tiles: int) -> TileLists:
     """List the splats of each tile, front to back; see `ordering_kernels`."""
+    from lapgs_plugin.reference_raster import ordering_kernels
+
     first_pair = empty(n + 1, np.int64)
     shown = ordering_kernels.count_pairs(n, boxes, first_pair)
     pairs = int(first_pair[n])
@@ -267,6 +274,8 @@ def list_tiles(n: int, boxes: NDArray[np.int32], depths: Floats, tiles_x: int, t
 @lru_cache
 def offsets(kind: Any) -> Floats:
     """Return `tile_kernels.pixel_offsets` of a float type, aligned for vector loads."""
+    from lapgs_plugin.reference_raster import tile_kernels
+
     unaligned = tile_kernels.pixel_offsets(kind)
     aligned = empty(unaligned.size, kind)
     np.copyto(aligned, unaligned)
